@@ -66,7 +66,13 @@ def test_some_begin_on_the_way_up(make_env):
 
 def test_the_reward_is_what_the_joints_say(make_env):
     """From lying, over being lifted, to standing."""
-    env = make_env(GET_UP, root_assist=1.0, control_cost=0.1)
+    margins = {
+        "upright.height_margin": 0.4,
+        "upright.tilt_margin": 0.7,
+        "still.speed_margin": 0.6,
+        "still.pose_margin": 0.3,
+    }
+    env = make_env(GET_UP, root_assist=1.0, control_cost=0.1, **margins)
     rule, rest, at_rest = env.config.upright, env.config.still, env.batch.simulation.flesh[0].points.joints[0]
     action, worth = 0.1 * env.action_space.high, []
     env.reset(seed=1)
