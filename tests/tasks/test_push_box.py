@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.tasks.push_box import ROOT_LEAD, WALK, PushBoxConfig, PushBoxTask
+from tests.tasks.measured import middle, pelvis, prop_motion, prop_particles, still, tolerance
 
 PUSH = "PIAvatar/PushBox-v0"
 GRAVITY = 9.81
@@ -24,36 +25,24 @@ BENT = {
 }
 
 
-def box_particles(env) -> tuple[slice, np.ndarray, np.ndarray, np.ndarray]:
-    """Where the box's particles are in the arrays; their masses [kg], places [m] and velocities [m/s]."""
-    simulation = env.batch.simulation
-    prop = simulation.props.props[simulation.props.index("box")]
-    own = slice(prop.first, prop.first + prop.count)
-    mass = simulation.model.particles.mass.numpy()[0, own].astype(float)
-    x, u = (getattr(simulation.state, name).numpy()[0, own].astype(float) for name in "xu")
-    return own, mass, x, u
-
-
 def box_pose(env) -> tuple[np.ndarray, Rotation]:
     """Centre of mass [m] and rotation of the box, from its particles."""
-    _, mass, x, _ = box_particles(env)
+    own, simulation = prop_particles(env.batch, "box"), env.batch.simulation
+    mass, x = (a.numpy()[0, own].astype(float) for a in (simulation.model.particles.mass, simulation.state.x))
     center = mass @ x / mass.sum()
     rest = env.batch.simulation.props.points[0].rest.astype(float)
     return center, Rotation.align_vectors(x - center, rest, weights=mass)[0]
 
 
+def box_motion(env) -> tuple[float, np.ndarray]:
+    """Mass [kg] and velocity [m/s] of the box."""
+    mass, _, velocity = prop_motion(env.batch, "box")
+    return mass[0], velocity[0]
+
+
 def hands(env) -> np.ndarray:
-    """Middles of the hands ``(2, 3)`` [m]: rest centres of mass, carried by the particles that track the wrists."""
-    simulation = env.batch.simulation
-    points, x = simulation.flesh[0].points, simulation.state.x.numpy()[0].astype(float)
-    rest, mass = points.rest[0].astype(float), points.mass[0].astype(float)
-    found = []
-    for name in ("left_wrist", "right_wrist"):
-        weight = mass * (points.skin_weights * (points.skin_joints == joint_index(name))).sum(1)
-        p = np.flatnonzero(points.bone == joint_index(name))
-        turn = Rotation.align_vectors(x[p] - x[p].mean(0), rest[p] - rest[p].mean(0))[0]
-        found.append(x[p].mean(0) + turn.apply(weight @ rest / weight.sum() - rest[p].mean(0)))
-    return np.array(found)
+    """Middles of the hands ``(2, 3)`` [m]."""
+    return np.array([middle(env, name) for name in ("left_wrist", "right_wrist")])
 
 
 def target(env) -> np.ndarray:
@@ -69,14 +58,14 @@ def gap(env, point) -> float:
 
 def set_box_velocity(env, velocity) -> None:
     u = env.batch.simulation.state.u.numpy()
-    u[0, box_particles(env)[0]] += np.float32(velocity)
+    u[0, prop_particles(env.batch, "box")] += np.float32(velocity)
     env.batch.simulation.state.u.assign(u)
 
 
 def bend_towards_box(env) -> np.ndarray:
     """Actions that bring the commanded joints to ``BENT``."""
     command = Rotation.from_quat(env.batch.simulation.avatar.state.command_rotation.numpy()[0])
-    action = np.zeros(env.action_space.shape)
+    action = still(env)
     step = env.config.control.joint_speed_limit * env.config.physics.control_dt
     for name, vector in BENT.items():
         for side, mirror in (("left", 1.0), ("right", -1.0)) if name.startswith("left") else (("", 1.0),):
@@ -95,18 +84,16 @@ def walk(env, forward: float) -> np.ndarray:
     return action
 
 
-@pytest.mark.parametrize("avatar", [None, {"position": [0.6, -0.3], "yaw": 2.0}])
-def test_box_and_target_are_drawn_before_the_avatar(make_env, avatar):
-    env = make_env(PUSH, **({} if avatar is None else {"scene.avatars": [avatar]}))
-    config, place, yaw = env.config, np.zeros(2), 0.0
-    if avatar is not None:
-        place, yaw = np.array(avatar["position"]), avatar["yaw"]
+def test_box_and_target_are_drawn_before_the_avatar(make_env):
+    place, yaw = np.array([0.6, -0.3]), 2.0
+    env = make_env(PUSH, **{"scene.avatars": [{"position": place.tolist(), "yaw": yaw}]})
+    config = env.config
     back = Rotation.from_rotvec([0.0, 0.0, -yaw])
     rows = []
     for seed in range(40):
         observation, _ = env.reset(seed=seed)
         center, turn = box_pose(env)
-        mass = box_particles(env)[1].sum()
+        mass = box_motion(env)[0]
         assert env.observation_layout.split(observation)["box_mass"] == pytest.approx(mass, rel=1e-4)
         out = back.apply([*(center[:2] - place), 0.0])
         assert out[0] == pytest.approx(0.0, abs=1e-4) and center[2] == pytest.approx(config.box_half_size[2], abs=1e-4)
@@ -139,14 +126,11 @@ def test_numbers_and_observations_are_those_of_numpy(make_env):
             gaps = [gap(env, hand) for hand in hands(env)]
             assert info["distance"] == pytest.approx(distance, abs=2e-5)
             assert [info["left_hand_gap"], info["right_hand_gap"]] == pytest.approx(gaps, abs=1e-4)
-            excess = np.maximum(distance - env.config.target_radius, 0.0) / max(
-                at_first - env.config.target_radius, 0.1
-            )
-            assert info["reward_terms"]["push"] == pytest.approx(0.8 * 10.0 ** -(excess**2), abs=2e-4)
-            near = np.maximum(np.array(gaps) - 0.1, 0.0) / env.config.hand_margin
-            assert info["reward_terms"]["hands"] == pytest.approx(0.1 * (10.0 ** -(near**2)).sum(), abs=2e-4)
-            _, mass, _, u = box_particles(env)
-            assert info["box_speed"] == pytest.approx(np.linalg.norm(mass @ u) / mass.sum(), abs=1e-4)
+            push = tolerance(distance, env.config.target_radius, max(at_first - env.config.target_radius, 0.1))
+            assert info["reward_terms"]["push"] == pytest.approx(0.8 * push, abs=2e-4)
+            near = sum(tolerance(hand_gap, 0.1, env.config.hand_margin) for hand_gap in gaps)
+            assert info["reward_terms"]["hands"] == pytest.approx(0.1 * near, abs=2e-4)
+            assert info["box_speed"] == pytest.approx(np.linalg.norm(box_motion(env)[1]), abs=1e-4)
             if abs(distance - env.config.target_radius) > 1e-4:
                 assert info["success"] == (distance < env.config.target_radius)
             successes.add(info["success"])
@@ -155,8 +139,7 @@ def test_numbers_and_observations_are_those_of_numpy(make_env):
 
 
 def check_observation(env, observation, center, way) -> None:
-    seen, tracked = env.observation_layout.split(observation), env.batch.simulation.avatar.tracked
-    at, turn = tracked.position.numpy()[0, 0], Rotation.from_quat(tracked.rotation.numpy()[0, 0])
+    seen, (at, turn) = env.observation_layout.split(observation), pelvis(env)
     assert at + turn.apply(seen["target_position"]) == pytest.approx(target(env), abs=1e-5)
     assert turn.apply(seen["target_from_box"]) == pytest.approx([way[0], way[1], 0.0], abs=2e-5)
     for side, hand in zip(("left", "right"), hands(env), strict=True):
@@ -183,8 +166,8 @@ def test_the_box_gains_the_momentum_that_the_body_gives(make_env):
         sensors = env.batch.simulation.sensors.pair_impulse.numpy()[0]
         given = -sensors[1]  # what the box, subject 1, does to the avatar, subject 0
         assert info["push_impulse"] == pytest.approx(np.linalg.norm(given), rel=1e-5, abs=1e-7)
-        _, mass, _, u = box_particles(env)
-        now = mass @ u
+        mass, velocity = box_motion(env)
+        now = mass * velocity
         assert (now - momentum)[:2] == pytest.approx(given[:2], abs=2e-3)
         momentum, total = now, total + given
     assert total[1] < -5.0, "the body has to have pushed"
@@ -194,39 +177,25 @@ def test_the_box_gains_the_momentum_that_the_body_gives(make_env):
 def test_friction_stops_a_sliding_box(make_env, friction):
     """As long as it slides, the floor takes ``friction`` of what it bears; on average it bears the weight."""
     env = make_env(PUSH, box_friction=friction, **STRAIGHT)
-    for seed in (0, 5):
-        env.reset(seed=seed)
-        mass, start, speed = box_particles(env)[1].sum(), box_pose(env)[0], 1.2
-        set_box_velocity(env, [0.0, -speed, 0.0])
-        time, dt = speed / (friction * GRAVITY), env.config.physics.control_dt
-        impulses, ways = [], []
-        for _ in range(round(time / dt) + 60):
-            env.step(np.zeros(env.action_space.shape))
-            impulses.append(env.batch.simulation.sensors.boundary_impulse.numpy()[0, 1].astype(float))
-            ways.append(start[1] - box_pose(env)[0][1])
-        impulses, sliding = np.array(impulses), round(0.4 * time / dt)  # it sways, and may stick for a moment later
-        assert impulses[:sliding, 1].sum() == pytest.approx(friction * impulses[:sliding, 2].sum(), rel=0.03)
-        assert (np.abs(impulses[:, 1]) <= 1.02 * friction * impulses[:, 2] + 1e-3).all()
-        assert impulses[:, 2].mean() == pytest.approx(mass * GRAVITY * dt, rel=0.05)
-        # its middle is farthest while it still leans forward; then it swings back, and creeps a little
-        assert max(ways) == pytest.approx(speed**2 / (2.0 * friction * GRAVITY), rel=0.15)
-        assert abs(np.mean(ways[-15:]) - np.mean(ways[-30:-15])) < 0.02
+    env.reset(seed=0)
+    mass, start, speed = box_motion(env)[0], box_pose(env)[0], 1.2
+    set_box_velocity(env, [0.0, -speed, 0.0])
+    time, dt = speed / (friction * GRAVITY), env.config.physics.control_dt
+    impulses, ways = [], []
+    for _ in range(round(time / dt) + 60):
+        env.step(still(env))
+        impulses.append(env.batch.simulation.sensors.boundary_impulse.numpy()[0, 1].astype(float))
+        ways.append(start[1] - box_pose(env)[0][1])
+    impulses, sliding = np.array(impulses), round(0.4 * time / dt)  # it sways, and may stick for a moment later
+    assert impulses[:sliding, 1].sum() == pytest.approx(friction * impulses[:sliding, 2].sum(), rel=0.03)
+    assert (np.abs(impulses[:, 1]) <= 1.02 * friction * impulses[:, 2] + 1e-3).all()
+    assert impulses[:, 2].mean() == pytest.approx(mass * GRAVITY * dt, rel=0.05)
+    # its middle is farthest while it still leans forward; then it swings back, and creeps a little
+    assert max(ways) == pytest.approx(speed**2 / (2.0 * friction * GRAVITY), rel=0.15)
+    assert abs(np.mean(ways[-15:]) - np.mean(ways[-30:-15])) < 0.02
 
 
-def test_walking_into_the_box_pushes_it_and_stopping_stops_it(make_env):
-    env = make_env(PUSH, **STRAIGHT)
-    env.reset(seed=2)
-    start = box_pose(env)[0]
-    for _ in range(45):
-        env.step(walk(env, 0.5))
-    moved = box_pose(env)[0]
-    assert moved[1] < start[1] - 0.1 and abs(moved[0] - start[0]) < 0.05
-    for _ in range(40):
-        info = env.step(np.zeros(env.action_space.shape))[4]
-    assert info["box_speed"] < 0.2 and abs(box_pose(env)[0][1] - moved[1]) < 0.15
-
-
-@pytest.mark.parametrize("seed", [0, 3, 8])
+@pytest.mark.parametrize("seed", [0, 3])
 def test_a_script_pushes_the_box_to_its_target(make_env, seed):
     """Bent, straight ahead, slower as the box comes near, and then still: within three quarters of an episode."""
     env = make_env(PUSH, **STRAIGHT)
@@ -239,12 +208,12 @@ def test_a_script_pushes_the_box_to_its_target(make_env, seed):
     assert info["success"] and info["distance"] < env.config.target_radius
 
 
-def test_what_blocks_the_body_holds_its_command_back(make_env):
+def test_a_wall_that_blocks_the_body_holds_its_command_back(make_env):
     """Backwards into a wall: without the clamp the command would run away, and the root would let go."""
     wall = {"name": "wall", "kind": "box", "size": [1.0, 0.1, 1.0], "position": [0.0, 0.45, 1.0]}
     env = make_env(PUSH, **STRAIGHT, **{"scene.colliders": [wall]})
     env.reset(seed=0)
-    action = np.zeros(env.action_space.shape)
+    action = still(env)
     action[env.action_names.index("root.y")] = 1.0
     leads = []
     for _ in range(60):
@@ -257,14 +226,14 @@ def test_what_blocks_the_body_holds_its_command_back(make_env):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "reason"),
     [
-        ({"box_mass": [9.0, 5.0]}, r"box_mass=\[9.0, 5.0\].*lower bound first"),
+        ({"box_mass": [9.0, 5.0]}, r"box_mass=\[9.0, 5.0\]"),
         ({"target_distance": [0.0, 1.0]}, r"target_distance=\[0.0, 1.0\].*positive"),
-        ({"box_distance": [0.5, 1.0]}, r"box_distance=\[0.5, 1.0\].*at least 0.74 m"),
+        ({"box_distance": [0.5, 1.0]}, r"box_distance=\[0.5, 1.0\].*0.74 m"),
         ({"scene.avatars": [{}, {}]}, "one avatar"),
     ],
 )
-def test_what_cannot_be_is_refused(settings, told):
-    with pytest.raises(ConfigError, match=told):
+def test_settings_that_cannot_be_are_refused(settings, reason):
+    with pytest.raises(ConfigError, match=reason):
         PushBoxTask(load_config(PushBoxConfig, None, settings))
