@@ -28,7 +28,7 @@ except ImportError:  # Windows has no such locks, so two trainings in one folder
 
 #: Files of a training: checkpoint, policies, and the figures that are written last.
 CHECKPOINT, POLICIES, RESULTS = "checkpoint.pt", ("policy.pt", "policy.zip"), "results.json"
-#: Folders that this process holds, and by what; the system lets go of them however the process ends.
+#: Folders that this process holds, and by what; the system releases them however the process ends.
 _HELD: dict[Path, int] = {}
 ROOT = Path(__file__).resolve().parents[1]
 #: Packages whose version is in every file of figures.

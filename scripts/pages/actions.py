@@ -1,4 +1,4 @@
-"""The section of a page on actions."""
+"""Section of a page on actions."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _under_torques(facts: Facts) -> str:
         f'With `control="pd"` or `"torque"` there are {size} components: neither the root nor the toes act. Under '
         f'`"pd"` a component is a target angle: 0 is {about}, 1 and -1 are the ends of the ranges above. Under '
         '`"torque"` it is a share of the greatest torque of the joint about that axis. Only the ground '
-        f"and `root_assist` hold the body then, no root lets go, and {terms} are observed as well."
+        f"and `root_assist` hold the body then, no root is released, and {terms} are observed as well."
     )
 
 

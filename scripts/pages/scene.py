@@ -1,4 +1,4 @@
-"""The section of a page on the scene: avatars, props and colliders."""
+"""Section of a page on the scene: avatars, props and colliders."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Section:
-    """Settings that stand together: those of the top (without a name), of a section, or of each entry of a list."""
+    """Settings of one level: the top (without a name), a section, or each entry of a list."""
 
     name: str
     description: str
@@ -50,7 +50,7 @@ class Section:
 
 
 def sections_of(config: EnvConfig) -> list[Section]:
-    """Every setting of a configuration, its values shown as defaults; the sections in their order, the top first."""
+    """Return every setting of a configuration with its value as the default, by section, the top first."""
     return list(_sections("", "", type(config), config, EnvConfig()))
 
 
@@ -71,7 +71,7 @@ def _sections(
             below.append((path, field.description or "", nested, inner, other))
             continue
         own = values is not None and (usual is None or key not in type(usual).model_fields or other != value)
-        # an entry of a list is no place that a keyword could name
+        # no keyword can name an entry of a list
         rows.append(_setting(key if name.endswith("[]") else path, field, value, own))
         item = _item_model(field.annotation)
         if item:
@@ -130,7 +130,7 @@ def shown(value: Any) -> str:
 
 
 def literal(value: Any) -> str:
-    """Return a value as a reader would write it, without quotes around the names of a mapping."""
+    """Return a value as users write it, without quotes around the names of a mapping."""
     if isinstance(value, BaseModel):
         # only the settings that set an entry apart
         return literal(value.model_dump(exclude_defaults=True))
