@@ -8,7 +8,7 @@ import warp as wp
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.rng import generator
 from piavatar_envs.core.structs import fill
-from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.envs.observations import ObservationLayout, write_vector
 from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.world import Simulation
 
@@ -70,6 +70,12 @@ def random_of(episodes: Episodes, e: int, stream: int, index: int):
 def rest_joint(body: Body, e: int, b: int):
     """Return the position of a joint in the rest pose [m]."""
     return body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+
+
+@wp.func
+def write_in_root(observation: wp.array3d(dtype=float), e: int, agent: int, start: int, bones: Bones, v: wp.vec3):
+    """Write a vector of the world, turned into the frame of the pelvis, from component ``start``."""
+    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(bones.rotation[e, 0]), v))
 
 
 class EpisodeArrays:

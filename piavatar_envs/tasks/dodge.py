@@ -15,8 +15,8 @@ from piavatar_envs.config import EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec, speed_within
-from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of, write_in_root
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.observer import clear_stress, observe_stress
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -239,7 +239,7 @@ def observe_place(
     """Write the place from the pelvis."""
     e = wp.tid()
     way = pelvis_at(rule.place, bones.body, e) - bones.position[e, 0]
-    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(bones.rotation[e, 0]), way))
+    write_in_root(observation, e, agent, start, bones, way)
 
 
 class DodgeTask(Task):

@@ -14,8 +14,8 @@ from piavatar_envs.config import ControlConfig, PoseControlConfig, SceneConfig
 from piavatar_envs.config.schema import Place
 from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
-from piavatar_envs.envs.episodes import Bones, Episodes, Props, random_of
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.episodes import Bones, Episodes, Props, random_of, write_in_root
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import TaskArray
 from piavatar_envs.tasks.common.ball_goal import GATE_TERMS, Ball, GateConfig, GateTask, turn_and_weigh
 from piavatar_envs.tasks.common.hands import flesh_middle
@@ -121,7 +121,7 @@ def observe_head(
 ):
     """Write the ball from the head from component ``start``."""
     e = wp.tid()
-    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(bones.rotation[e, 0]), ball[e] - head[e]))
+    write_in_root(observation, e, agent, start, bones, ball[e] - head[e])
 
 
 class HeaderTask(GateTask):

@@ -16,7 +16,7 @@ from piavatar_envs.config.schema import Length
 from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of, write_in_root
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -181,12 +181,11 @@ def observe(
 ):
     """Write all but the last of ``PushBoxTask.observation_terms`` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(bones.rotation[e, 0])
     box = props.position[e, push.box]
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, target[e] - bones.position[e, 0]))
-    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, to_go(box, target[e])))
-    write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, box - hands[e, 0]))
-    write_vector(observation, e, agent, start + 9, wp.quat_rotate(to_root, box - hands[e, 1]))
+    write_in_root(observation, e, agent, start, bones, target[e] - bones.position[e, 0])
+    write_in_root(observation, e, agent, start + 3, bones, to_go(box, target[e]))
+    write_in_root(observation, e, agent, start + 6, bones, box - hands[e, 0])
+    write_in_root(observation, e, agent, start + 9, bones, box - hands[e, 1])
     observation[e, agent, start + 12] = push.volume * props.density[e, push.box]
 
 

@@ -9,12 +9,11 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import EnvConfig
 from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
-from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of, rest_joint
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of, rest_joint, write_in_root
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.tasks.common.hands import LEFT_WRIST, RIGHT_WRIST, flesh_middle
@@ -24,9 +23,9 @@ from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
-#: Bounds of the course: azimuth to either side, elevation, share of the speed, and a whole turn [rad].
+#: Bounds of the course: azimuth to either side, elevation, share of the speed, a whole turn [rad]; its middle.
 SIDE, BELOW, ABOVE = wp.constant(1.6), wp.constant(-0.7), wp.constant(0.9)
-SLOWEST, TURN = wp.constant(0.3), wp.constant(6.2831853)
+SLOWEST, TURN, CHEST = wp.constant(0.3), wp.constant(6.2831853), wp.constant(joint_index("spine3"))
 COURSE = (
     Parameter("target_azimuth", "rad", -SIDE, SIDE, "middle of the swing, from the front"),
     Parameter("target_elevation", "rad", BELOW, ABOVE, "middle of the swing, upwards"),
@@ -60,51 +59,46 @@ class Target:
     margin: float
     control_cost: float
     control_dt: float
-    center: int  # joint at the sphere's centre in the rest pose
+
+
+@wp.struct
+class Swing:
+    """Motion of the target, ``(num_envs,)``."""
+
+    course: wp.array(dtype=wp.vec4)  # parameters COURSE
+    phase: wp.array(dtype=wp.vec2)  # parameters PHASE
+    goal: wp.array(dtype=wp.vec3)  # the target's present position [m]
 
 
 @wp.kernel
-def draw_target(
-    episodes: Episodes,
-    # out
-    course: wp.array(dtype=wp.vec4),
-    phase: wp.array(dtype=wp.vec2),
-):
-    """Draw the parameters :data:`COURSE` and :data:`PHASE`."""
+def draw_target(episodes: Episodes, swing: Swing):
+    """Draw course and phase in the masked environments."""
     e = wp.tid()
     if episodes.mask[e]:
         random = random_of(episodes, e, STREAM_TASK, 0)
         azimuth, elevation = wp.randf(random, -SIDE, SIDE), wp.randf(random, BELOW, ABOVE)
-        pace, tilt = wp.randf(random, SLOWEST, 1.0), wp.randf(random, 0.0, TURN)
-        course[e] = wp.vec4(azimuth, elevation, pace, tilt)
-        phase[e] = wp.vec2(wp.randf(random, 0.0, TURN), wp.randf(random, 0.0, TURN))
+        swing.course[e] = wp.vec4(azimuth, elevation, wp.randf(random, SLOWEST, 1.0), wp.randf(random, 0.0, TURN))
+        swing.phase[e] = wp.vec2(wp.randf(random, 0.0, TURN), wp.randf(random, 0.0, TURN))
 
 
 @wp.func
-def goal_at(target: Target, body: Body, e: int, course: wp.vec4, phase: wp.vec2, time: float):
+def goal_at(target: Target, swing: Swing, bones: Bones, e: int, time: float):
     """Return the target's position: both angles swing by 0.35 rad about the course, within the bound of the speed."""
-    swing = 0.35
-    rate = target.target_speed * course[2] / (swing * target.radius * 1.4143)
-    azimuth = course[0] + swing * wp.cos(course[3]) * wp.sin(rate * time + phase[0])
-    elevation = course[1] + swing * wp.sin(course[3]) * wp.sin(rate * time + phase[1])
+    course, phase, size = swing.course[e], swing.phase[e], 0.35
+    rate = target.target_speed * course[2] / (size * target.radius * 1.4143)
+    azimuth = course[0] + size * wp.cos(course[3]) * wp.sin(rate * time + phase[0])
+    elevation = course[1] + size * wp.sin(course[3]) * wp.sin(rate * time + phase[1])
     out = wp.vec3(wp.sin(azimuth) * wp.cos(elevation), -wp.cos(azimuth) * wp.cos(elevation), wp.sin(elevation))
-    return rest_joint(body, e, target.center) + target.radius * out
+    return rest_joint(bones.body, e, CHEST) + target.radius * out
 
 
 @wp.kernel
 def judge(
-    target: Target,
-    bones: Bones,
-    episodes: Episodes,
-    course: wp.array(dtype=wp.vec4),
-    phase: wp.array(dtype=wp.vec2),
-    action: wp.array3d(dtype=float),
-    # out
-    outcome: Outcome,
+    target: Target, swing: Swing, bones: Bones, episodes: Episodes, action: wp.array3d(dtype=float), outcome: Outcome
 ):
     """Reward the nearer hand. The step counter has not moved yet: the state is one step ahead of it."""
     e = wp.tid()
-    goal = goal_at(target, bones.body, e, course[e], phase[e], target.control_dt * float(episodes.step_count[e] + 1))
+    goal = goal_at(target, swing, bones, e, target.control_dt * float(episodes.step_count[e] + 1))
     left = wp.length(flesh_middle(bones, e, LEFT_WRIST) - goal)
     right = wp.length(flesh_middle(bones, e, RIGHT_WRIST) - goal)
     distance = wp.min(left, right)
@@ -118,29 +112,18 @@ def judge(
 
 @wp.kernel
 def observe(
-    target: Target,
-    bones: Bones,
-    episodes: Episodes,
-    course: wp.array(dtype=wp.vec4),
-    phase: wp.array(dtype=wp.vec2),
-    start: int,
-    # out
-    goal: wp.array(dtype=wp.vec3),
-    observation: wp.array3d(dtype=float),
+    target: Target, swing: Swing, bones: Bones, episodes: Episodes, start: int, observation: wp.array3d(dtype=float)
 ):
     """Write the target's position, and ``ReachTask.observation_terms`` from component ``start``."""
     e = wp.tid()
     time = target.control_dt * float(episodes.step_count[e])
-    here = goal_at(target, bones.body, e, course[e], phase[e], time)
-    next = goal_at(target, bones.body, e, course[e], phase[e], time + target.control_dt)
-    goal[e] = here
-    to_root = wp.quat_inverse(bones.rotation[e, 0])
-    write_vector(observation, e, 0, start, wp.quat_rotate(to_root, here - bones.position[e, 0]))
-    write_vector(observation, e, 0, start + 3, wp.quat_rotate(to_root, (next - here) / target.control_dt))
-    left = flesh_middle(bones, e, LEFT_WRIST)
-    write_vector(observation, e, 0, start + 6, wp.quat_rotate(to_root, here - left))
-    right = flesh_middle(bones, e, RIGHT_WRIST)
-    write_vector(observation, e, 0, start + 9, wp.quat_rotate(to_root, here - right))
+    here = goal_at(target, swing, bones, e, time)
+    next = goal_at(target, swing, bones, e, time + target.control_dt)
+    swing.goal[e] = here
+    write_in_root(observation, e, 0, start, bones, here - bones.position[e, 0])
+    write_in_root(observation, e, 0, start + 3, bones, (next - here) / target.control_dt)
+    write_in_root(observation, e, 0, start + 6, bones, here - flesh_middle(bones, e, LEFT_WRIST))
+    write_in_root(observation, e, 0, start + 9, bones, here - flesh_middle(bones, e, RIGHT_WRIST))
 
 
 class ReachTask(Task):
@@ -176,18 +159,18 @@ the middle of either hand to the target and stays with it."""
     }  # fmt: skip
 
     def allocate(self, env) -> None:
-        target = fill(Target(), self.config, self.config.physics, center=joint_index("spine3"))
-        self.inputs = [target, env.bones[0], env.episodes, self.course, self.phase]
+        self.swing, target = fill(Swing(), self), fill(Target(), self.config, self.config.physics)
+        self.inputs = [target, self.swing, env.bones[0], env.episodes]
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
-        graph.launch(draw_target, env.num_envs, [env.episodes], [self.course, self.phase])
+        graph.launch(draw_target, env.num_envs, [env.episodes], [self.swing])
 
     def record_outcome(self, env, graph) -> None:
         graph.launch(judge, env.num_envs, [*self.inputs, env.action], [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        graph.launch(observe, env.num_envs, [*self.inputs, start], [self.goal, env.observation])
+        graph.launch(observe, env.num_envs, [*self.inputs, start], [env.observation])
 
     def markers(self, env, index: int) -> list:
         return [(self.goal.numpy()[index].copy(), self.config.target_radius, (0.95, 0.35, 0.2))]

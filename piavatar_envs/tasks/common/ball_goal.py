@@ -14,8 +14,8 @@ from piavatar_envs.config import EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.config.schema import Place
 from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
-from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of, write_in_root
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
@@ -240,9 +240,8 @@ def observe_gate(
 ):
     """Write :data:`GATE_TERMS` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(bones.rotation[e, 0])
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, course.center[e] - bones.position[e, 0]))
-    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, course.center[e] - ball[e]))
+    write_in_root(observation, e, agent, start, bones, course.center[e] - bones.position[e, 0])
+    write_in_root(observation, e, agent, start + 3, bones, course.center[e] - ball[e])
     # a tenth and ten times the mass differ by as much, as the effects of a kick do
     observation[e, agent, start + 6] = wp.log10(density[e] * gate.ball_volume)
     observation[e, agent, start + 7] = wp.max(course.best[e][0], 0.0)
@@ -260,9 +259,8 @@ def observe_feet(
 ):
     """Write the terms :data:`FEET_TERMS` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(bones.rotation[e, 0])
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, ball[e] - bones.position[e, _LEFT_FOOT]))
-    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, ball[e] - bones.position[e, _RIGHT_FOOT]))
+    write_in_root(observation, e, agent, start, bones, ball[e] - bones.position[e, _LEFT_FOOT])
+    write_in_root(observation, e, agent, start + 3, bones, ball[e] - bones.position[e, _RIGHT_FOOT])
 
 
 #: Observed by agents that kick.

@@ -14,8 +14,8 @@ from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConf
 from piavatar_envs.config.schema import select_joints
 from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
-from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of, write_in_root
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
@@ -144,13 +144,12 @@ def observe_hands(
 ):
     """Write ``HighFiveTask.observation_terms`` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(bones.rotation[e, 0])
     own = hands.middle[e, agent]
     other = 1 - agent
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, own - bones.position[e, 0]))
-    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, hands.direction[e, agent]))
-    write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, hands.middle[e, other] - own))
-    write_vector(observation, e, agent, start + 9, wp.quat_rotate(to_root, hands.velocity[e, other]))
+    write_in_root(observation, e, agent, start, bones, own - bones.position[e, 0])
+    write_in_root(observation, e, agent, start + 3, bones, hands.direction[e, agent])
+    write_in_root(observation, e, agent, start + 6, bones, hands.middle[e, other] - own)
+    write_in_root(observation, e, agent, start + 9, bones, hands.velocity[e, other])
 
 
 @wp.kernel

@@ -11,8 +11,8 @@ from piavatar_envs.config.schema import select_joints
 from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec, speed_within
-from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of, write_in_root
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
@@ -216,13 +216,12 @@ def observe_game(
     """Write the state of the game from component ``start``; agents are counted on from the observing one."""
     e = wp.tid()
     agents = pelvis.shape[1]
-    to_root = wp.quat_inverse(bones.rotation[e, 0])
     own = pelvis[e, agent]
     to = pelvis[e, goes_to(play, e, agents)]
     home = wp.vec3(place[0] - own[0], place[1] - own[1], 0.0)
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, to - own))
-    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, to - ball[e]))
-    write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, home))
+    write_in_root(observation, e, agent, start, bones, to - own)
+    write_in_root(observation, e, agent, start + 3, bones, to - ball[e])
+    write_in_root(observation, e, agent, start + 6, bones, home)
     # a tenth and ten times the mass differ by as much, as the effects of a kick do
     observation[e, agent, start + 9] = wp.log10(density[e] * rule.ball_volume)
     observation[e, agent, start + 10] = float(play.touched[e])
