@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, load_motion
+from piavatar_envs.avatar.motion.deepmimic import lay_hands_on_ground
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights
-from piavatar_envs.avatar.motion.hands import lay_hands_on_ground
 from piavatar_envs.avatar.motion.motion import hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, retarget
 

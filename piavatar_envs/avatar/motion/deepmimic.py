@@ -6,18 +6,24 @@ character skills", 2018. The clips are read from the user's own installation, no
 A frame is 44 numbers: duration [s], root position [m], root wxyz, chest wxyz, neck wxyz, then for the right and the
 left side hip wxyz, knee [rad], ankle wxyz, shoulder wxyz, elbow [rad]. The world is y-up; the character faces +x, its
 right is +z, and in the zero pose its arms and legs hang straight down.
+
+The character's arms end at the wrist, with which it pushes itself up. Our hand is 18 cm longer, and would enter the
+ground there or lift the whole body off it; :func:`lay_hands_on_ground` bends the wrists.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights, padded
 from piavatar_envs.avatar.motion.motion import Motion, ease, hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, leg_length, retarget, root_path
 
@@ -208,3 +214,76 @@ def _world_rotations(frames: np.ndarray) -> tuple[list[Rotation], np.ndarray]:
         world[f"{side}_shoulder"] = world["spine3"] * ball(start + 9)
         world[f"{side}_elbow"] = world[f"{side}_wrist"] = world[f"{side}_shoulder"] * hinge(start + 13)
     return [world[name] for name in JOINT_NAMES], frames[:, 1:4]
+
+
+if TYPE_CHECKING:
+    from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
+    from piavatar_envs.avatar.motion.motion import Motion
+
+MAX_BEND = np.radians(85.0)  # of a wrist
+CLEARANCE = 0.03  # [m] of the hand's middle line above the ground: half its thickness
+_SMOOTHING = 0.08  # [s] reach of the average over time
+
+
+def lay_hands_on_ground(motion: Motion, asset: AvatarAsset, body: ShapedBody | None, window: float) -> Motion:
+    """Bend the wrists, towards the back of the hand where it can be chosen, until the fingers are above the ground.
+
+    Args:
+        motion: a clip; its wrists must be where the ground is meant to be, hands apart.
+        asset: the avatar.
+        body: one of its shapes; without it the mean shape.
+        window: of the ground level, as in :meth:`Motion.on_ground` [s].
+    """
+    wrists = (joint_index("left_wrist"), joint_index("right_wrist"))
+    level = ground_level(lowest_heights(motion, asset, body, ignored=wrists), motion.fps, window, motion.loop)
+    shape = asset if body is None else body
+    rest = np.asarray(shape.joints, dtype=np.float64)
+    quaternions = motion.local_rotations.copy()
+    turns, positions = motion.joint_frames(rest)
+    for wrist in wrists:
+        middle, back = _hand(shape.vertices, asset, rest, wrist)
+        length = np.linalg.norm(middle)
+        along, across = turns[:, wrist, 2] @ (middle / length), turns[:, wrist, 2] @ back
+        wanted = np.clip((CLEARANCE - (positions[:, wrist, 2] - level)) / length, -1.0, 1.0)
+        angle = _smoothed(_bend(along, across, wanted), motion.fps, motion.loop)
+        axis = np.cross(middle / length, back)
+        bent = Rotation.from_quat(quaternions[:, wrist], scalar_first=True) * Rotation.from_rotvec(
+            angle[:, None] * axis
+        )
+        quaternions[:, wrist] = bent.as_quat(scalar_first=True)
+    return replace(motion, local_rotations=quaternions)
+
+
+def _bend(along: np.ndarray, across: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the smallest angle [rad] that makes the fingers' rise ``along cos + across sin`` at least ``wanted``.
+
+    Args:
+        along: rise of the fingers' direction, shape ``(num_frames,)``.
+        across: rise of the back of the hand.
+        wanted: the least rise.
+    """
+    swing = np.hypot(along, across)
+    # The angle at which the fingers point highest; a hand that hangs straight down bends to its back.
+    highest = np.arctan2(across, along)
+    highest = np.where(highest < -0.8 * np.pi, highest + 2.0 * np.pi, highest)
+    reached = np.arccos(np.clip(wanted / np.maximum(swing, 1e-9), -1.0, 1.0))
+    angle = np.sign(highest) * np.maximum(np.abs(highest) - reached, 0.0)
+    return np.clip(np.where(along >= wanted, 0.0, angle), -MAX_BEND, MAX_BEND)
+
+
+def _hand(vertices: np.ndarray, asset: AvatarAsset, rest: np.ndarray, wrist: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return wrist to middle fingertip [m] and the unit normal of the back of the hand, at rest, each ``(3,)``."""
+    weight = np.where(asset.skin_joints == wrist, asset.skin_weights, 0.0).sum(axis=1)
+    offsets = np.asarray(vertices, dtype=np.float64)[weight > 0.9] - rest[wrist]
+    centre = offsets.mean(axis=0)
+    middle = centre / np.linalg.norm(centre) * (offsets @ centre).max() / np.linalg.norm(centre)
+    # A hand is flat: its thinnest direction is the normal. At rest palms look down and inwards.
+    normal = np.linalg.svd(offsets - centre, full_matrices=False)[2][2]
+    normal = normal - (normal @ middle) / (middle @ middle) * middle
+    return middle, normal / np.linalg.norm(normal) * np.sign(normal[2])
+
+
+def _smoothed(values: np.ndarray, fps: float, loop: bool) -> np.ndarray:
+    radius = int(np.ceil(_SMOOTHING * fps))
+    kernel = np.hanning(2 * radius + 3)[1:-1]
+    return np.convolve(padded(values, radius, loop), kernel / kernel.sum(), mode="valid")

@@ -16,7 +16,7 @@ import numpy as np
 
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import amass, clips, deepmimic
-from piavatar_envs.avatar.motion.hands import lay_hands_on_ground
+from piavatar_envs.avatar.motion.deepmimic import lay_hands_on_ground
 from piavatar_envs.avatar.motion.motion import Motion
 
 if TYPE_CHECKING:
