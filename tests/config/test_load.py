@@ -1,4 +1,4 @@
-"""Configurations: errors name key, value and limit; sources merge in order; round trips lose nothing."""
+"""Configurations: sources merge in order, control modes choose their settings, round trips lose nothing."""
 
 from __future__ import annotations
 
@@ -25,79 +25,10 @@ from piavatar_envs.config.errors import models_of, setting_keys
 
 
 class Task(EnvConfig):
-    """A task's configuration, as tasks/ writes them: one level below EnvConfig."""
+    """A task's configuration."""
 
     target_radius: float = Field(0.1, gt=0.0, le=1.0, description="radius of the target [m]")
     span: tuple[float, float] = Field((0.3, 0.9), description="nearest and farthest target [m]")
-
-
-def refusal(source=None, overrides=None, cls=Task) -> str:
-    with pytest.raises(ConfigError) as caught:
-        load_config(cls, source, overrides)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
-
-
-@pytest.mark.parametrize(
-    ("overrides", "key", "limit"),
-    [
-        ({"control.tone": 1.5}, "control.tone=1.5", "<= 1"),
-        ({"control": {"tone": -0.1}}, "control.tone=-0.1", ">= 0"),
-        ({"physics.control_dt": 0}, "physics.control_dt=0", ">= 0.0001 [s]"),
-        ({"physics.poisson_ratio": 0.5}, "physics.poisson_ratio=0.5", "< 0.5"),
-        ({"fidelity": "ultra"}, "physics.fidelity='ultra'", "one of 'tiny', 'coarse', 'medium' or 'fine'"),
-        ({"young_modulus": "soft"}, "physics.young_modulus='soft'", "a number [Pa]"),
-        ({"young_modulus": "100000"}, "physics.young_modulus='100000'", "a number [Pa]"),
-        ({"tone": True}, "control.tone=True", "a number"),
-        ({"num_substeps": 1.5}, "physics.num_substeps=1.5", "a whole number"),
-        ({"free_motion": 1}, "control.free_motion=1", "true or false"),
-        ({"tone": float("nan")}, "control.tone=nan", "a finite number"),
-        ({"density": float("inf")}, "physics.density=inf", "a finite number [kg/m^3]"),
-        ({"shape.parameters.age": 2}, "shape.parameters.age=2", "<= 1"),
-        ({"physics": 3}, "physics=3", "a section, with its settings below it"),
-        ({"target_radius": 2.0}, "target_radius=2.0", "<= 1 [m]"),
-        ({"width": 8}, "render.width=8", ">= 16 [pixel]"),
-        ({"control.ton": 1}, "control.ton ", "control.tone?"),
-        ({"control.young_modulus": 1}, "control.young_modulus ", "physics.young_modulus?"),
-        ({"physcs": {"fidelity": "tiny"}}, "physcs ", "physics?"),
-        ({"target_radius.x": 1}, "target_radius={'x': 1}", "a number [m]"),
-        ({"control": {"tone": 0.1}, "tone": 0.2}, "control.tone", "given twice"),
-    ],
-)
-def test_a_refusal_names_key_value_and_limit(overrides, key, limit):
-    message = refusal(None, overrides)
-    assert message.startswith(key) and limit in message
-
-
-def test_an_unlike_key_is_answered_with_what_there_is():
-    message = refusal(None, {"physics.qqqq": 1})
-    assert message.startswith("physics.qqqq is no setting of Task; there are physics.fidelity, ")
-
-
-def test_all_errors_come_in_one_line_with_their_file(tmp_path):
-    path = tmp_path / "bad.yaml"
-    path.write_text("physics:\n  density: -1\nobs_mode: both\n")
-    message = refusal(path, {"tone": 7})
-    assert f"{path}: physics.density=-1 must be >= 0.1 [kg/m^3]" in message
-    assert f"{path}: obs_mode='both' must be one of 'flat' or 'dict'" in message
-    assert "; control.tone=7 must be <= 1; " in message  # not the file's fault
-
-
-def test_files_that_cannot_be_read(tmp_path):
-    assert "cannot read the configuration" in refusal(tmp_path / "none.yaml")
-    endless = tmp_path / "endless.yaml"
-    endless.write_text("control: &d {tone: 0.3, more: *d}")
-    assert "has a value that holds itself; write it out" in refusal(endless)
-    broken = tmp_path / "broken.yaml"
-    broken.write_text("physics: [1,\n")
-    assert f"{broken} is not YAML" in refusal(broken)
-    broken.write_text("- a\n- b\n")
-    assert "holds a list, not settings" in refusal(broken)
-    broken.write_text("control:\n  tone: 0.1\n  tone: 0.2\n")
-    assert "'tone' is given twice" in refusal(broken)
-    broken.write_text("control: !!python/object/apply:os.getcwd []\n")
-    assert "is not YAML" in refusal(broken)
 
 
 def test_file_then_keywords(tmp_path):
@@ -110,30 +41,18 @@ def test_file_then_keywords(tmp_path):
     assert config.control == Task().control  # an empty section is one with defaults
 
 
-def test_a_mapping_may_begin_as_another_one(tmp_path):
-    """By YAML's merge keys; what it says itself wins, and is not given twice by that."""
+def test_merge_keys_of_yaml_are_followed(tmp_path):
+    """Use YAML's merge keys: the mapping's own values win, and do not count as given twice."""
     path = tmp_path / "merged.yaml"
     path.write_text("shape:\n  parameters:\n    <<: {age: 0.5, weight: 0.1}\n    weight: 0.2\n")
     assert load_config(Task, path).shape.parameters == {"age": 0.5, "weight": 0.2}
 
 
-def test_an_ambiguous_name_is_refused():
-    class Left(BaseModel):
-        same: int = 0
-
-    class Two(BaseModel):
-        left: Left = Left()
-        right: Left = Left()
-
-    assert refusal(None, {"same": 1}, Two) == "same is ambiguous in Two; say which: left.same or right.same"
-
-
-def test_numpy_and_tuples_are_welcome():
+def test_numpy_and_tuples_are_accepted():
     config = load_config(
         Task, None, {"tone": np.float32(0.5), "span": np.array([0.1, 0.2]), "num_substeps": np.int64(9)}
     )
     assert config.control.tone == 0.5 and config.span == (0.1, 0.2) and config.physics.num_substeps == 9
-    assert "a setting is a number" in refusal(None, {"tone": object()})
 
 
 def test_printed_and_read_back_is_the_same(tmp_path):
@@ -145,7 +64,7 @@ def test_printed_and_read_back_is_the_same(tmp_path):
     assert set(yaml.safe_load(path.read_text())) == set(Task.model_fields)
 
 
-def test_frozen_all_through_hashable_and_copied():
+def test_configurations_are_frozen_hashable_and_copied():
     config = load_config(Task, None, {"shape.parameters.age": 0.3})
     with pytest.raises(ValidationError):
         config.obs_mode = "dict"
@@ -198,7 +117,7 @@ def test_every_setting_is_described_with_its_unit():
 
 
 class Held(EnvConfig):
-    """A task that has another mode, and a setting of its own in that mode."""
+    """A task with torque control by default, and a default of its own in that mode."""
 
     control: ControlConfig = Field(
         default_factory=lambda: TorqueControlConfig(root_assist=0.4), description="how actions move the body"
@@ -206,7 +125,7 @@ class Held(EnvConfig):
 
 
 class Quick(EnvConfig):
-    """A task that has the usual mode, and a setting of its own in that mode."""
+    """A task with pose control by default, and a default of its own in that mode."""
 
     control: ControlConfig = Field(
         default_factory=lambda: PoseControlConfig(joint_speed_limit=7.0), description="how actions move the body"
@@ -234,25 +153,11 @@ def test_a_mode_is_chosen_by_any_name(overrides, tmp_path):
 
 
 def test_settings_of_the_tasks_mode_need_no_mode():
-    assert load_config(Held, None, {"strength": 0.5}).control == TorqueControlConfig(root_assist=0.4, strength=0.5)
+    held = load_config(Held, None, {"strength": 0.5})
+    assert held.control == TorqueControlConfig(root_assist=0.4, strength=0.5)
+    assert replace(held, {"control.strength": 0.25}).control == held.control.model_copy(update={"strength": 0.25})
     assert load_config(Held, None, {"control": "torque"}).control.root_assist == 0.4
     assert load_config(Quick, None, {"tone": 0.5}).control == PoseControlConfig(joint_speed_limit=7.0, tone=0.5)
-
-
-@pytest.mark.parametrize(
-    ("cls", "overrides", "key", "mode"),
-    [
-        (Task, {"root_assist": 0.5}, "control.root_assist=0.5", "'pd' or 'torque'"),
-        (Task, {"control": "pd", "tone": 0.5}, "control.tone=0.5", "'pose'"),
-        (Task, {"control": {"mode": "torque", "alpha": 0.1}}, "control.alpha=0.1", "'pose'"),
-        (Held, {"tone": 1.0}, "control.tone=1.0", "'pose'"),
-        (Held, {"scene": {"avatars": [{}, {"control": {"tone": 0}}]}}, "scene.avatars.1.control.tone=0", "'pose'"),
-        (Task, {"scene": {"avatars": [{"control.strength": 2}]}}, "scene.avatars.0.control.strength=2", "'pd' or"),
-    ],
-)
-def test_a_setting_of_another_mode_is_refused_with_its_mode(cls, overrides, key, mode):
-    message = refusal(None, overrides, cls)
-    assert message.startswith(f"{key} belongs to control.mode={mode}")
 
 
 def test_another_mode_begins_with_its_defaults():
@@ -262,16 +167,3 @@ def test_another_mode_begins_with_its_defaults():
     assert replace(under_torques, control="torque").control == TorqueControlConfig(mode="torque", strength=2.0)
     assert replace(under_torques, control="pose").control == PoseControlConfig(joint_speed_limit=7.0)
     assert load_config(Held, None, {"control": "pose"}).control == PoseControlConfig()
-
-
-def test_a_mode_that_there_is_not_is_refused():
-    for mode in ("push", 3, ["pd"]):
-        assert refusal(None, {"control": mode}).startswith(
-            f"control.mode={mode!r} must be one of 'pose', 'pd', 'torque'"
-        )
-
-
-def test_a_part_of_a_section_leaves_the_tasks_own_defaults_of_the_rest():
-    config = load_config(Held, None, {"strength": 0.5, "control.joint_damping": 0.7})
-    assert config.control == TorqueControlConfig(root_assist=0.4, strength=0.5, joint_damping=0.7)
-    assert replace(config, {"control.strength": 0.25}).control == config.control.model_copy(update={"strength": 0.25})

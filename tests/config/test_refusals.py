@@ -1,98 +1,171 @@
-"""What is no setting is refused by its place, in lists and files too; what is one has limits."""
+"""Refused settings: the error names key, value and limit, within lists and files too."""
 
 from __future__ import annotations
 
 import importlib.util
-import re
 from typing import Annotated, Literal, get_args, get_origin
 
 import pytest
+from pydantic import BaseModel, Field
 
-from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.config import ConfigError, ControlConfig, EnvConfig, TorqueControlConfig, load_config
 from piavatar_envs.config.errors import entry_of, models_of
 from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks import load_task, task_modules
 
 
-def refusal(source=None, overrides=None) -> str:
+class Task(EnvConfig):
+    """A task's configuration."""
+
+    target_radius: float = Field(0.1, gt=0.0, le=1.0, description="radius of the target [m]")
+
+
+class Held(EnvConfig):
+    """A task with torque control by default."""
+
+    control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
+
+
+def refusal(source=None, overrides=None, cls=Task) -> str:
     with pytest.raises(ConfigError) as caught:
-        load_config(EnvConfig, source, overrides)
-    return str(caught.value)
+        load_config(cls, source, overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def avatar(**settings) -> dict:
+    return {"scene": {"avatars": [settings]}}
+
+
+def prop(**settings) -> dict:
+    return {"scene": {"props": [{"name": "a", **settings}]}}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "words"),
+    [
+        ({"control.tone": 1.5}, "control.tone=1.5", "<= 1"),
+        ({"physics.control_dt": 0}, "physics.control_dt=0", ">= 0.0001 [s]"),
+        ({"physics.poisson_ratio": 0.5}, "physics.poisson_ratio=0.5", "< 0.5"),
+        ({"fidelity": "ultra"}, "physics.fidelity='ultra'", "'tiny', 'coarse', 'medium' or 'fine'"),
+        ({"young_modulus": "100000"}, "physics.young_modulus='100000'", "a number [Pa]"),
+        ({"tone": True}, "control.tone=True", "a number"),
+        ({"tone": object()}, "control.tone=", "a number"),
+        ({"num_substeps": 1.5}, "physics.num_substeps=1.5", "a whole number"),
+        ({"free_motion": 1}, "control.free_motion=1", "true or false"),
+        ({"tone": float("nan")}, "control.tone=nan", "a finite number"),
+        ({"density": float("inf")}, "physics.density=inf", "a finite number [kg/m^3]"),
+        ({"shape.parameters.age": 2}, "shape.parameters.age=2", "<= 1"),
+        ({"physics": 3}, "physics=3", "a section"),
+        ({"target_radius": 2.0}, "target_radius=2.0", "<= 1 [m]"),
+        ({"width": 8}, "render.width=8", ">= 16 [pixel]"),
+        ({"control.ton": 1}, "control.ton ", "control.tone?"),
+        ({"control.young_modulus": 1}, "control.young_modulus ", "physics.young_modulus?"),
+        ({"physcs": {"fidelity": "tiny"}}, "physcs ", "physics?"),
+        ({"physics.qqqq": 1}, "physics.qqqq ", "physics.fidelity, "),
+        ({"target_radius.x": 1}, "target_radius={'x': 1}", "a number [m]"),
+        ({"control": {"tone": 0.1}, "tone": 0.2}, "control.tone", "given twice"),
+        ({"control": "push"}, "control.mode='push'", "'pose', 'pd', 'torque'"),
+        ({"control": ["pd"]}, "control.mode=['pd']", "'pose', 'pd', 'torque'"),
+        ({"num_envs": 4}, "num_envs ", "gym.make_vec"),
+        ({"seed": 3}, "seed ", "reset(seed=...)"),
+        ({"scene": {"seed": 3}}, "scene.seed ", "scene."),
+        (avatar(positon=[0, 0]), "scene.avatars.0.positon ", "position"),
+        (avatar(qqq=0), "scene.avatars.0.qqq ", "position, yaw, "),
+        (avatar(yaw="left"), "scene.avatars.0.yaw='left'", "a number [rad]"),
+        (avatar(control={"tone": 2, "alpha": 3}), "scene.avatars.0.control.tone=2", "scene.avatars.0.control.alpha=3"),
+        (avatar(**{"control.tone": 2}), "scene.avatars.0.control.tone=2", "<= 1"),
+        (avatar(physics={"fidelity": "fine"}), "scene.avatars.0.physics.fidelity ", "cannot differ"),
+        (avatar(shape={"scal": 1}), "scene.avatars.0.shape.scal ", "scale"),
+        (avatar(regions=[{"joints": ["tail"]}]), "scene.avatars.0.regions.0.joints.0='tail'", "unknown"),
+        ({"scene": {"colliders": [{"name": "a", "sise": 1}]}}, "scene.colliders.0.sise ", "size"),
+        ({"scene": {"colliders": [None]}}, "scene.colliders.0=None", "a section"),
+        (prop(position=[0, 0, 0, 0]), "scene.props.0.position=[0, 0, 0, 0]", "at most 3"),
+        (prop(name=""), "scene.props.0.name=''", "at least 1 character"),
+        (prop(size=[-1]), "scene.props.0.size.0=-1", "> 0 [m]"),
+        (prop(rotation=[1e-9, 0, 0, 0]), "scene.props.0.rotation", "not zero"),
+    ],
+)
+def test_a_refusal_names_key_value_and_limit(overrides, key, words):
+    message = refusal(None, overrides)
+    assert message.startswith(key) and words in message, message
+
+
+@pytest.mark.parametrize(
+    ("cls", "overrides", "key", "mode"),
+    [
+        (Task, {"root_assist": 0.5}, "control.root_assist=0.5", "'pd' or 'torque'"),
+        (Task, {"control": "pd", "tone": 0.5}, "control.tone=0.5", "'pose'"),
+        (Task, {"control": {"mode": "torque", "alpha": 0.1}}, "control.alpha=0.1", "'pose'"),
+        (Held, {"tone": 1.0}, "control.tone=1.0", "'pose'"),
+        (Held, {"scene": {"avatars": [{}, {"control": {"tone": 0}}]}}, "scene.avatars.1.control.tone=0", "'pose'"),
+        (Task, avatar(**{"control.strength": 2}), "scene.avatars.0.control.strength=2", "'pd' or"),
+    ],
+)
+def test_a_setting_of_another_mode_is_refused_with_its_mode(cls, overrides, key, mode):
+    assert refusal(None, overrides, cls).startswith(f"{key} belongs to control.mode={mode}")
+
+
+@pytest.mark.parametrize("given", [[1], 0, False, (), b"a.yaml", EnvConfig])
+def test_a_source_of_another_type_is_refused(given):
+    for message in (refusal(given), refusal(None, given)):
+        assert f"={given!r} is of type {type(given).__name__}" in message
+
+
+def test_an_ambiguous_name_is_refused():
+    class Left(BaseModel):
+        same: int = 0
+
+    class Two(BaseModel):
+        left: Left = Left()
+        right: Left = Left()
+
+    message = refusal(None, {"same": 1}, Two)
+    assert message.startswith("same ") and "left.same or right.same" in message
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("control: &d {tone: 0.3, more: *d}", "holds itself"),
+        ("physics: [1,\n", "bad.yaml is not YAML"),
+        ("control: !!python/object/apply:os.getcwd []\n", "bad.yaml is not YAML"),
+        ("- a\n- b\n", "a list"),
+        ("control:\n  tone: 0.1\n  tone: 0.2\n", "'tone' is given twice"),
+        ("control:\n  tone: 2020-01-01\n", "control.tone=datetime.date(2020, 1, 1)"),
+        ("shape:\n  parameters: {1: 0.5}\n", "shape.parameters.1"),
+        ("control.: 1\n", "'control.'"),
+        (f"density: 1{'0' * 400}\n", "a finite number [kg/m^3]"),
+        ("scene:\n  avatars:\n  - yaw: left\n", "bad.yaml: scene.avatars.0.yaw='left'"),
+    ],
+)
+def test_bad_files_are_refused_with_the_place_of_the_fault(tmp_path, text, words):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    assert words in refusal(path)
+
+
+def test_all_errors_come_in_one_line_with_their_source(tmp_path):
+    assert "none.yaml" in refusal(tmp_path / "none.yaml")
+    path = tmp_path / "bad.yaml"
+    path.write_text("physics:\n  density: -1\nobs_mode: both\n")
+    faults = refusal(path, {"tone": 7}).split("; ")
+    assert any(fault.startswith(f"{path}: physics.density=-1 ") for fault in faults)
+    assert any(fault.startswith(f"{path}: obs_mode='both' ") for fault in faults)
+    assert any(fault.startswith("control.tone=7 ") for fault in faults)  # of a keyword
 
 
 def configs() -> list[type[EnvConfig]]:
-    """Of all tasks and games."""
+    """Return the configurations of all tasks and games."""
     found = [load_task(env_id).Config for env_id in task_modules()]
     if importlib.util.find_spec("pettingzoo"):
         found += [load_game(name).TASK.Config for name in listed_games()]
     return found
 
 
-@pytest.mark.parametrize("given", [[1], 0, False, (), 5.0, b"a.yaml", EnvConfig])
-def test_what_is_no_settings_is_not_taken_for_none(given):
-    for message in (refusal(given), refusal(None, given)):
-        assert f"={given!r} is of type {type(given).__name__}; settings are a mapping of names to values" in message
-
-
-@pytest.mark.parametrize(
-    ("scene", "told"),
-    [
-        ({"avatars": [{"positon": [0, 0]}]}, "avatars.0.positon is no setting of AvatarConfig; did you mean X.positi"),
-        ({"avatars": [{}, {"qqq": 0}]}, "avatars.1.qqq is no setting of AvatarConfig; there are position, yaw, "),
-        ({"avatars": [{"yaw": "left"}]}, "avatars.0.yaw='left' must be a number [rad]"),
-        ({"avatars": [{"control": {"tone": 2, "alpha": 3}}]}, "avatars.0.control.tone=2 must be <= 1; X.control.alp"),
-        ({"avatars": [{"control.tone": 2}]}, "avatars.0.control.tone=2 must be <= 1"),
-        ({"avatars": [{"physics": {"fidelity": "fine"}}]}, "avatars.0.physics.fidelity cannot differ between avatars"),
-        ({"avatars": [{"shape": {"scal": 1}}]}, "avatars.0.shape.scal is no setting of ShapeConfig; did you mean sca"),
-        ({"avatars": [{"regions": [{"joints": ["tail"]}]}]}, "avatars.0.regions.0.joints.0='tail' is refused: unknown"),
-        ({"colliders": [{"name": "a", "sise": 1}]}, "colliders.0.sise is no setting of ColliderConfig; did you mean X"),
-        ({"colliders": [None]}, "colliders.0=None must be a section"),
-        ({"props": [{"name": "a", "position": [0, 0, 0, 0]}]}, "props.0.position=[0, 0, 0, 0] must be a list of at mo"),
-        ({"props": [{"name": ""}]}, "props.0.name='' must be a string of at least 1 character"),
-        ({"props": [{"name": "a", "size": [-1]}]}, "props.0.size.0=-1 must be > 0 [m]"),
-        ({"props": [{"name": "a", "rotation": [1e-9, 0, 0, 0]}]}, "must be a quaternion wxyz, not zero"),
-        ({"props": [{"name": "a", None: 1}]}, "props.0.None is of type NoneType; the name of a setting is a string"),
-        ({"pair_friction": [{"a": "x", "b": "y", "friction": -1}]}, "pair_friction.0.friction=-1 must be >= 0"),
-    ],
-)  # fmt: skip
-def test_refusals_within_lists_say_which_entry(scene, told):
-    place = re.match(r"\w+\.\d+", told)
-    assert told.replace("X", f"scene.{place[0]}" if place else "") in refusal(None, {"scene": scene})
-
-
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        ({"num_envs": 4}, "num_envs is no setting of EnvConfig; use gym.make_vec(..., num_envs=...)"),
-        ({"seed": 3}, "seed is no setting of EnvConfig; use reset(seed=...)"),
-        ({"scene": {"seed": 3}}, "scene.seed is no setting of EnvConfig; there are scene."),
-    ],
-)
-def test_what_belongs_elsewhere_is_sent_there(given, told):
-    assert told in refusal(None, given)
-
-
-def test_an_entry_of_a_file_is_the_files_fault_and_one_of_a_keyword_is_not(tmp_path):
-    path = tmp_path / "bad.yaml"
-    path.write_text("scene:\n  avatars:\n  - yaw: left\n")
-    assert refusal(path) == f"{path}: scene.avatars.0.yaw='left' must be a number [rad]"
-    assert refusal(path, {"scene": {"avatars": [{"yaw": "right"}]}}).startswith("scene.avatars.0.yaw='right' must")
-
-
-def test_what_yaml_makes_of_values_is_refused_by_name(tmp_path):
-    path = tmp_path / "odd.yaml"
-    for text, told in {
-        "control:\n  tone: 2020-01-01\n": "control.tone=datetime.date(2020, 1, 1) is of type date; a setting is",
-        "shape:\n  parameters: {1: 0.5}\n": "shape.parameters.1 is of type int; the name of a setting is a string",
-        "control.: 1\n": "'control.' is no name of a setting",
-        f"density: 1{'0' * 400}\n": "0000... must be a finite number [kg/m^3]",
-    }.items():
-        path.write_text(text)
-        assert told in refusal(path)
-
-
 def test_every_number_has_an_upper_limit():
-    """Beyond them are overflows, not physics; lengths of lists and counts are limited where they are used."""
+    """Values beyond are overflows, not physics; lengths of lists and counts are limited by the code that uses them."""
 
     def numbers(annotation, limits):
         if get_origin(annotation) is Annotated:
