@@ -1,3 +1,5 @@
+"""Skin: exact under rigid motions and skinning, smooth, and local."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -49,7 +51,7 @@ def test_a_uniform_displacement_moves_the_skin_by_it(subject, bent_pose):
 
 
 def test_a_limb_takes_nothing_from_its_neighbour(subject):
-    """The legs touch, yet what moves the particles of one must leave the skin of the other where it is."""
+    """Move the particles of one leg, which touches the other."""
     leg = [skeleton.joint_index(f"right_{name}") for name in ("hip", "knee", "ankle", "foot")]
     share = joint_share(subject.particles.skin_joints, subject.particles.skin_weights, leg)
     positions = subject.positions.astype(np.float64).copy()
@@ -70,7 +72,7 @@ def test_interpolation_keeps_constants_and_bounds(subject):
 
 
 def test_the_skin_follows_a_smooth_displacement(subject):
-    """A bulge of the particles shows on the skin: the height field is reproduced to a fraction of the spacing."""
+    """Reproduce a height field of the particles to a fraction of their spacing."""
 
     def height(points: np.ndarray) -> np.ndarray:
         return 0.1 * np.sin(2.0 * points[:, 2])
@@ -80,8 +82,8 @@ def test_the_skin_follows_a_smooth_displacement(subject):
     assert np.abs(error).max() < 0.2 * 2.0 * 0.035
 
 
-def test_what_neighbours_differ_by_does_not_crumple_the_skin(subject):
-    """Particles that are off by 5 mm each, a seventh of their spacing, stretch hardly any edge of the mesh by much."""
+def test_noise_of_particles_does_not_crumple_the_skin(subject):
+    """Displace particles by 5 mm each, a seventh of their spacing: hardly any edge is stretched by much."""
     noise = 0.005 * np.random.default_rng(0).normal(size=(subject.skin.num_particles, 3))
     moved = subject.skin.interpolate(noise)
     faces, vertices = subject.asset.faces, subject.body.vertices
@@ -101,5 +103,5 @@ def test_bad_particles_are_refused(subject):
 
 
 def joint_share(joints: np.ndarray, weights: np.ndarray, wanted: list[int]) -> np.ndarray:
-    """Sum of the weights that belong to the wanted joints, shape ``(N,)``."""
+    """Return the sum of the weights that belong to the wanted joints, shape ``(N,)``."""
     return np.where(np.isin(joints, wanted), weights, 0.0).sum(axis=1)

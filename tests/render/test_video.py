@@ -1,3 +1,5 @@
+"""Videos and GIFs: frames, timing, memory, and refusals."""
+
 from __future__ import annotations
 
 import gc
@@ -52,7 +54,7 @@ def test_mp4_frames_are_not_hoarded(tmp_path):
     assert len(alive) == 30 and most <= 4
 
 
-@pytest.mark.parametrize("fps", [10.0, 24.0, 30.0, 47.3, 50.0])
+@pytest.mark.parametrize("fps", [10.0, 30.0, 47.3])
 def test_a_gif_keeps_time(tmp_path, fps):
     path = write_video(tmp_path / "clip.gif", moving_square(31), fps)
     with Image.open(path) as gif:
@@ -61,7 +63,7 @@ def test_a_gif_keeps_time(tmp_path, fps):
     np.testing.assert_allclose(ends, 1000.0 / fps * np.arange(1, 32), atol=10.0)
 
 
-def test_no_frame_of_a_gif_is_quicker_than_viewers_take(tmp_path):
+def test_frames_of_a_gif_last_as_long_as_viewers_need(tmp_path):
     with Image.open(write_video(tmp_path / "clip.gif", moving_square(9), fps=60)) as gif:
         assert {gif.seek(index) or gif.info["duration"] for index in range(gif.n_frames)} == {20}
 
@@ -74,7 +76,7 @@ def test_a_still_gif_is_small(tmp_path):
 @pytest.mark.parametrize(
     ("name", "frames", "fps", "message"),
     [
-        ("clip.avi", moving_square(1), 30, r"clip\.avi ends in '\.avi'; use \.mp4 or \.gif"),
+        ("clip.avi", moving_square(1), 30, r"clip\.avi.*\.mp4 or \.gif"),
         ("clip.mp4", [], 30, "at least one"),
         ("clip.gif", [], 30, "at least one"),
         ("clip.mp4", moving_square(1), 0, "fps=0"),
