@@ -1,4 +1,4 @@
-"""``watch``: endless play, the controls of the panel, and a quiet end."""
+"""``watch``: endless play, the controls of the panel, and the end by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytest.importorskip("viser", reason='needs pip install "piavatar-envs[live]"')
 
 @pytest.fixture
 def open_show(device):
-    """A maker of shows whose time only passes as they let it: ``show, env, time = open_show(env_id)``."""
+    """A maker of shows with a clock that only they move: ``show, env, time, begun = open_show(env_id)``."""
     opened = []
 
     def start(env_id: str, **settings):
@@ -56,7 +56,7 @@ def test_it_plays_one_episode_after_the_other(open_show):
     assert time.now - 100.0 == pytest.approx(0.5)
 
 
-def test_the_panel_pauses_steps_and_begins_anew(open_show):
+def test_the_panel_pauses_steps_and_resets(open_show):
     show, env, _, begun = open_show("PIAvatar/Reach-v0")
     show.turn()
     show.panel.play(False)
@@ -75,29 +75,23 @@ def test_the_panel_pauses_steps_and_begins_anew(open_show):
     assert steps_done(env) == 1 and show.panel._play.label == "Pause"
 
 
-def test_the_panel_sets_the_speed(open_show):
+def test_the_panel_sets_the_speed_and_a_pause_shows_the_last_step(open_show):
+    """At high speed not every step is shown; the last one is, as soon as it is paused."""
     show, _, time, _ = open_show("PIAvatar/Reach-v0")
     show.panel.speed = 0.5
     show.turn()
     assert time.now - 100.0 == pytest.approx(2.0 / 30.0)
     show.panel.speed = 4.0
-    show.turn()
-    assert time.now - 100.0 == pytest.approx(2.25 / 30.0)
-
-
-def test_a_pause_shows_the_last_step(open_show):
-    """At high speed a screen is not sent every step; the last one is, when it stands still."""
-    show, _, _, _ = open_show("PIAvatar/Reach-v0")
-    show.panel.speed = 4.0
     for _ in range(2):
         show.turn()
+    assert time.now - 100.0 == pytest.approx(2.5 / 30.0)
     assert show._live._behind
     show.panel.play(False)
     show.turn()
     assert not show._live._behind and show._live._progress.since_last() == 0.0
 
 
-def test_the_panel_changes_the_colour_also_while_it_stands_still(open_show):
+def test_the_panel_changes_the_colour_while_paused(open_show):
     show, env, _, _ = open_show("PIAvatar/Reach-v0")
     show.panel.play(False)
     show.panel.color = "strain"
@@ -111,13 +105,13 @@ def test_the_panel_shows_the_reward(open_show):
     show, *_ = open_show("PIAvatar/Reach-v0")
     show.panel.request_step()
     show.turn()
-    told = table(show)
-    assert "PIAvatar/Reach-v0" in told and f"| return | {show._return:.2f} |" in told
+    content = table(show)
+    assert "PIAvatar/Reach-v0" in content and f"| return | {show._return:.2f} |" in content
     for name, value in show._info["reward_terms"].items():
-        assert f"| {name} | {value:+.3f} |" in told
+        assert f"| {name} | {value:+.3f} |" in content
 
 
-def test_worlds_of_several_agents_are_watched_too(open_show):
+def test_games_are_watched(open_show):
     pytest.importorskip("pettingzoo")
     show, *_ = open_show("sumo_v0")
     show.panel.request_step()
@@ -127,30 +121,22 @@ def test_worlds_of_several_agents_are_watched_too(open_show):
 
 
 @pytest.mark.parametrize(
-    ("args", "told"),
+    ("args", "words"),
     [
-        (["watch", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'; there are "),
-        (["watch", "PIAvatar/Reach-v0", "--seed", "-1"], "error: seed=-1 must be >= 0 and <= 4294967295\n"),
-        (["watch", "Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
-        (["watch", "PIAvatar/Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
-        (["watch", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here; use play --video"),
-        (["play", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here; use play --video"),
+        (["watch", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'"),
+        (["watch", "PIAvatar/Reach-v0", "--seed", "-1"], "seed=-1 must be >= 0"),
+        (["watch", "Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 "),
+        (["watch", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here"),
     ],
 )
-def test_mistakes_end_in_one_line(capsys, device, args, told):
+def test_mistakes_end_in_one_line(capsys, device, args, words):
     with pytest.raises(SystemExit) as stop:
         cli.main([*args, "--device", device] if "Reach" in args[1] else args)
     error = capsys.readouterr().err
-    assert stop.value.code == 2 and told in error and "Traceback" not in error
+    assert stop.value.code == 2 and words in error and "Traceback" not in error
 
 
-def test_a_port_is_refused_before_anything_is_built(monkeypatch):
-    monkeypatch.setattr(watch, "make", None)
-    with pytest.raises(ValueError, match="port=0 is outside"):
-        watch.watch("Reach-v0", port=0)
-
-
-def test_a_missing_viser_ends_in_one_line(monkeypatch, capsys):
+def test_a_missing_viser_is_named_in_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(SystemExit) as stop:
         cli.main(["watch", "PIAvatar/Reach-v0"])
@@ -158,7 +144,7 @@ def test_a_missing_viser_ends_in_one_line(monkeypatch, capsys):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
-def test_ctrl_c_ends_it_quietly(device):
+def test_ctrl_c_ends_it_without_a_traceback(device):
     line = [sys.executable, "-m", "piavatar_envs", "watch", "PIAvatar/Reach-v0", "--device", device, "--port", "8400"]
     run = subprocess.Popen(
         [*line, "-c", "fidelity=tiny"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
