@@ -16,7 +16,7 @@ GAINS = np.r_[0.0, 0.0, np.ones(NUM_JOINTS - 1)][None]
 
 
 def carried_by() -> np.ndarray:
-    """Whether joint ``c`` carries bone ``b``, shape ``(c, b)``."""
+    """Return whether joint ``c`` carries bone ``b``, shape ``(c, b)``."""
     carries = np.eye(NUM_JOINTS)
     for bone in range(NUM_JOINTS - 1, 0, -1):
         above = PARENTS[bone]
@@ -27,7 +27,7 @@ def carried_by() -> np.ndarray:
 
 
 def momentum_of(J: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Generalised momentum ``J^T m v`` of velocities of the particles, shape ``(69,)``."""
+    """Return the generalised momentum ``J^T m v`` of velocities of the particles, shape ``(69,)``."""
     return np.einsum("pia,p,pi->a", J, m, v)
 
 
@@ -63,7 +63,7 @@ class Joints:
         graph.run()
 
     def substep(self, step: int) -> LaunchGraph:
-        """The first substep of a control step (0), or one without a mass matrix of its own (1).
+        """Record the first substep of a control step (0), or one without a mass matrix of its own (1).
 
         Either finds joints wherever they have been put.
         """
@@ -74,7 +74,7 @@ class Joints:
         return graph
 
     def control_step(self) -> LaunchGraph:
-        """A control step of joints and particles; nothing of it has run."""
+        """Record a control step of joints and particles."""
         rig, model, graph = self.rig, self.model, LaunchGraph(self.model.device)
         record_begin(graph, model, rig.state, rig.scratch)
         for step in range(model.num_substeps):
@@ -85,11 +85,11 @@ class Joints:
 
     @property
     def jacobian(self) -> np.ndarray:
-        """``J`` at the particles, shape ``(P, 3, 69)``."""
+        """Return ``J`` at the particles, shape ``(P, 3, 69)``."""
         return self.jacobian_at(self.rig.read("x"), self.body.state.position.numpy()[0].astype(float))
 
     def jacobian_at(self, x, position) -> np.ndarray:
-        """``J`` where particles and joints are at other places [m]."""
+        """Return ``J`` where particles and joints are at other places [m]."""
         share = self.rig.weights.astype(float)
         share = (share / share.sum(1, keepdims=True)) @ carried_by().T
         J = np.zeros((len(x), 3, NUM_DOF))
@@ -101,7 +101,7 @@ class Joints:
         return J
 
     def moved(self, velocity, time) -> tuple[np.ndarray, np.ndarray]:
-        """Local rotations, ``(22, 3, 3)``, and place of the pelvis after a time [s] at a velocity of the joints."""
+        """Return local rotations, ``(22, 3, 3)``, and the place of the pelvis after a time [s] at a velocity."""
         s = self.body.state
         spin = carried_by().T @ velocity[3:].reshape(NUM_JOINTS, 3)  # a bone spins with all joints that carry it
         begin = Rotation.from_quat(s.rotation.numpy()[0].astype(float))
@@ -110,32 +110,32 @@ class Joints:
         return local, s.position.numpy()[0, 0].astype(float) + time * velocity[:3]
 
     def skinning(self, velocity) -> np.ndarray:
-        """Velocity of the skinned places, by central differences, shape ``(P, 3)``."""
+        """Return the velocity of the skinned places, by central differences, shape ``(P, 3)``."""
         after, before = (self.rig.skinned(*self.moved(velocity, time)) for time in (1e-4, -1e-4))
         return (after - before) / 2e-4
 
     def halfway(self, velocity) -> np.ndarray:
-        """``J`` half a step on, bones and particles moved by a velocity of the joints."""
+        """Return ``J`` half a step on, bones and particles moved by a velocity of the joints."""
         half = 0.5 * self.model.step.dt
         _, positions = forward_kinematics(*self.moved(velocity, half), self.rig.points.joints[0].astype(float))
         return self.jacobian_at(self.rig.read("x") + half * (self.jacobian @ velocity), positions)
 
     @property
     def besides(self) -> np.ndarray:
-        """Inertia with which joints take over, besides that of the limbs they move, shape ``(69,)``."""
+        """Return the inertia with which joints take over, besides that of the limbs they move, shape ``(69,)``."""
         return self.body._workspace.diagonals.numpy()[0].astype(float)
 
     @property
     def mass(self) -> np.ndarray:
-        """The mass matrix, shape ``(69, 69)``."""
+        """Return the mass matrix, shape ``(69, 69)``."""
         return self.body.mass.read()[0]
 
     @property
     def total(self) -> np.ndarray:
-        """Velocity of the particles [m/s]."""
+        """Return the velocity of the particles [m/s]."""
         return self.rig.read("u") + self.rig.read("vk")
 
     def momenta(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Momentum, angular momentum, and the sum of ``m |v|``."""
+        """Return the momentum, angular momentum, and the sum of ``m |v|``."""
         m, x, v = self.rig.mass, self.rig.read("x"), self.total
         return m @ v, m @ np.cross(x, v), float(m @ np.linalg.norm(v, axis=1))

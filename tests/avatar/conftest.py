@@ -33,7 +33,7 @@ TORSO = [joint_index(n) for n in ("pelvis", "spine1", "spine2", "spine3", "neck"
 
 
 def mean_rigid_motion(mass, x, v):
-    """Centre, its velocity and angular velocity of the least-squares rigid motion (double precision)."""
+    """Return the centre, its velocity and angular velocity of the least-squares rigid motion (double precision)."""
     c = mass @ x / mass.sum()
     V = mass @ v / mass.sum()
     d = x - c
@@ -43,7 +43,7 @@ def mean_rigid_motion(mass, x, v):
 
 
 def blended_rigid_part(weights, mass, x, v):
-    """Bone by bone least-squares rigid motions of ``v``, blended by the skinning weights (double precision)."""
+    """Return least-squares rigid motions of ``v``, bone by bone, blended by the skinning weights."""
     blended = np.zeros_like(v)
     for bone in range(weights.shape[1]):
         c, V, W = mean_rigid_motion(mass * weights[:, bone], x, v)
@@ -112,19 +112,19 @@ class Rig:
             self.step_graph.run()
 
     def quaternions(self, rotvec) -> np.ndarray:
-        """Warp's quaternions of local rotation vectors, one set an environment."""
+        """Return Warp's quaternions of local rotation vectors, one set an environment."""
         rotvec = np.array(np.broadcast_to(rotvec, (self.model.num_envs, NUM_JOINTS, 3)))
         return Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_quat().reshape(-1, NUM_JOINTS, 4).astype(np.float32)
 
     # ---- reading
     @property
     def mass(self) -> np.ndarray:
-        """Mass of every particle of the first environment [kg], double precision."""
+        """Return mass of every particle of the first environment [kg], double precision."""
         return self.points.mass[0].astype(float)
 
     @property
     def weights(self) -> np.ndarray:
-        """Dense skinning weights, shape ``(P, 22)``."""
+        """Return the dense skinning weights, shape ``(P, 22)``."""
         dense = np.zeros((self.points.num_points, NUM_JOINTS))
         for slot in range(4):
             rows = np.arange(self.points.num_points)
@@ -132,50 +132,50 @@ class Rig:
         return dense
 
     def read(self, name: str, env: int = 0) -> np.ndarray:
-        """One array of the state, double precision."""
+        """Return one array of the state, double precision."""
         return self.state.numpy()[name][env].astype(float)
 
     def skinned(self, rotations, root, env: int = 0) -> np.ndarray:
-        """Particles of a pose by NumPy's forward kinematics and skinning."""
+        """Return particles of a pose by NumPy's forward kinematics and skinning."""
         p, row = self.points, min(env, len(self.points.rest) - 1)
         joints = p.joints[min(env, len(p.joints) - 1)].astype(float)
         world, positions = forward_kinematics(rotations, root, joints)
         return skin(p.rest[row].astype(float), p.skin_joints, p.skin_weights.astype(float), world, positions, joints)
 
     def target(self, env: int = 0) -> np.ndarray:
-        """Particles of the commanded pose."""
+        """Return particles of the commanded pose."""
         d = self.avatar.state
         rotations = Rotation.from_quat(d.goal_rotation.numpy()[env].astype(float)).as_matrix()
         return self.skinned(rotations, d.goal_root.numpy()[env].astype(float), env)
 
     def tracked_world(self, env: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Tracked world rotations ``(22, 3, 3)`` and joint positions."""
+        """Return the tracked world rotations ``(22, 3, 3)`` and joint positions."""
         t = self.avatar.tracked
         return Rotation.from_quat(t.rotation.numpy()[env].astype(float)).as_matrix(), t.position.numpy()[env].astype(
             float
         )
 
     def tracked_local(self, env: int = 0) -> np.ndarray:
-        """Tracked local rotations, shape ``(22, 3, 3)``."""
+        """Return the tracked local rotations, shape ``(22, 3, 3)``."""
         world = self.tracked_world(env)[0]
         return np.stack([world[0], *(world[PARENTS[b]].T @ world[b] for b in range(1, NUM_JOINTS))])
 
     def joint_errors(self, env: int = 0) -> np.ndarray:
-        """Angle between commanded and tracked local rotation of every joint but the root [rad]."""
+        """Return the angle between commanded and tracked local rotation of every joint but the root [rad]."""
         command = Rotation.from_quat(self.avatar.state.command_rotation.numpy()[env].astype(float))
         return (command.inv() * Rotation.from_matrix(self.tracked_local(env))).magnitude()[1:]
 
     def shape_error(self, env: int = 0) -> np.ndarray:
-        """Distance of the particles from the skinned tracked pose [m]."""
+        """Return the distance of the particles from the skinned tracked pose [m]."""
         root = self.tracked_world(env)[1][0]
         return np.linalg.norm(self.read("x", env) - self.skinned(self.tracked_local(env), root, env), axis=1)
 
     def pose_error(self, env: int = 0) -> np.ndarray:
-        """Distance of the particles from the skinned commanded pose [m]."""
+        """Return the distance of the particles from the skinned commanded pose [m]."""
         return np.linalg.norm(self.read("x", env) - self.target(env), axis=1)
 
     def everything(self) -> dict[str, np.ndarray]:
-        """All that a checkpoint would hold, and the tracked pose."""
+        """Return all that a checkpoint would hold, and the tracked pose."""
         drive, tracked = (
             {field.name: getattr(group, field.name).numpy().copy() for field in fields(group)}
             for group in (self.avatar.state, self.avatar.tracked)
@@ -186,12 +186,12 @@ class Rig:
         return totals(self.model, self.state, env, about=about)
 
     def energy(self) -> float:
-        """Kinetic and elastic energy [J]."""
+        """Return the kinetic and elastic energy [J]."""
         t = self.totals()
         return t.kinetic + t.elastic
 
     def rigid_motion(self, total: bool = True):
-        """Centre, velocity, angular velocity of the whole body (of ``u + vk``, or of ``u`` alone)."""
+        """Return the centre, velocity, angular velocity of the whole body (of ``u + vk``, or of ``u`` alone)."""
         v = self.read("u") + (self.read("vk") if total else 0.0)
         return mean_rigid_motion(self.mass, self.read("x"), v)
 
@@ -228,7 +228,7 @@ class Rig:
         self.add_velocity(dv)
 
     def push(self, force, joint: str = "spine3") -> None:
-        """One control step's worth of a force [N] on the flesh of a bone."""
+        """Push the flesh of a bone with a force [N] for a control step."""
         w = self.weights[:, joint_index(joint)]
         impulse = np.asarray(force, float) * self.model.control_dt
         self.add_velocity(w[:, None] / (self.mass @ w) * impulse)
@@ -249,7 +249,7 @@ def build_rig(
     colliders: Sequence[Collider] = (),
     **settings,
 ) -> Rig:
-    """A standing avatar ``cells`` grid spacings tall.
+    """Build a standing avatar ``cells`` grid spacings tall.
 
     ``shapes`` are shape parameters by name, one set an environment; ``room`` is the half width of the domain [m]; so
     many ``others`` are particles that come before the avatar's, in a row in the domain's corner. ``colliders`` follow
@@ -294,7 +294,7 @@ def build_rig(
 
 @pytest.fixture(scope="session")
 def make_rig(device: str) -> Callable[..., Rig]:
-    """:func:`build_rig` on the device under test. Every call builds a rig of its own."""
+    """Return :func:`build_rig` on the device under test; every call builds another rig."""
 
     def make(**options) -> Rig:
         return build_rig(device, **options)
@@ -303,7 +303,7 @@ def make_rig(device: str) -> Callable[..., Rig]:
 
 
 def random_pose(rng: np.random.Generator, scale: float = 0.6) -> np.ndarray:
-    """Local rotation vectors of a wild pose, shape ``(22, 3)``: limbs up to 1.5 rad, spine and head 0.4 of it."""
+    """Return rotation vectors of a wild pose, shape ``(22, 3)``: limbs up to 1.5 rad, spine and head 0.4 of it."""
     rotvec = rng.normal(size=(NUM_JOINTS, 3)) * scale
     rotvec[[joint_index(n) for n in ("spine1", "spine2", "spine3", "neck", "head", "left_collar", "right_collar")]] *= (
         0.4
@@ -314,11 +314,5 @@ def random_pose(rng: np.random.Generator, scale: float = 0.6) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def wild_pose() -> Callable[..., np.ndarray]:
-    """:func:`random_pose`."""
+    """Return :func:`random_pose`."""
     return random_pose
-
-
-@pytest.fixture(scope="session", name="blended_rigid_part")
-def blended_rigid_part_fixture() -> Callable[..., np.ndarray]:
-    """:func:`blended_rigid_part`."""
-    return blended_rigid_part

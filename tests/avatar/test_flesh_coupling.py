@@ -8,7 +8,6 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness
-from piavatar_envs.avatar.body.muscles import joint_torques, make_muscles
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
@@ -40,7 +39,7 @@ class Held(Joints):
         self.body.set_tissue(nothing, nothing, -EVERYWHERE, EVERYWHERE, TOES)
 
     def start(self):
-        """In the rest pose, where the pelvis is held."""
+        """Start in the rest pose, where the pelvis is held."""
         self.pose(np.zeros((NUM_JOINTS, 3)))
         self.body.target.root.assign(self.body.state.position.numpy()[:, 0])
         self.graph = self.control_step()
@@ -53,12 +52,12 @@ class Held(Joints):
         self.body.target.rotation.assign(Rotation.from_rotvec(target).as_quat()[None].astype(np.float32))
 
     def local(self) -> np.ndarray:
-        """Rotation vectors of the pair, ``(2, 3)`` [rad]."""
+        """Return the rotation vectors of the pair, ``(2, 3)`` [rad]."""
         world = Rotation.from_quat(self.body.state.rotation.numpy()[0].astype(float))
         return np.stack([(world[PARENTS[b]].inv() * world[b]).as_rotvec() for b in self.joints])
 
     def torque(self) -> np.ndarray:
-        """Torques that the pair got in the last substep, in the frame of the parents, ``(2, 3)`` [N m]."""
+        """Return torques that the pair got in the last substep, in the frame of the parents, ``(2, 3)`` [N m]."""
         impulse = self.body.impulse.numpy()[0].astype(float).reshape(-1, 3)[1:] / self.model.step.dt
         world = Rotation.from_quat(self.body.state.rotation.numpy()[0].astype(float))
         return np.stack([world[PARENTS[b]].inv().apply(impulse[b]) for b in self.joints])
@@ -66,9 +65,9 @@ class Held(Joints):
 
 @pytest.fixture(scope="module")
 def pressed(make_rig) -> dict[float, dict[str, np.ndarray]]:
-    """Feet that press their toes on the floor, by the damping of the ankles; nothing weighs anything."""
+    """Press toes on the floor without gravity; return what is measured, by the damping of the ankles."""
     found = {}
-    for damping in (2.0, 20.0, 200.0):
+    for damping in (20.0, 200.0):
         held = Held(make_rig(cells=24, floor=True), ANKLES, 300.0, damping).start()
         held.aim([0.3, 0.0, 0.0])
         for _ in range(60 if damping < 100.0 else 200):  # it creeps to its rest in D / K = 0.67 s
@@ -84,25 +83,21 @@ def pressed(make_rig) -> dict[float, dict[str, np.ndarray]]:
     return found
 
 
-@pytest.mark.parametrize("damping", [2.0, 20.0, 200.0])
-def test_a_blocked_foot_transmits_its_spring(pressed, damping):
-    """``tau = K e``, and the floor pushes back at the lever of the foot, whatever the damper."""
-    seen = pressed[damping]
-    assert seen["speed"] < 0.02
-    assert seen["error"].min() > 0.05  # it is blocked
-    np.testing.assert_allclose(seen["torque"], 300.0 * seen["error"], rtol=0.03)
-    assert seen["floor"] == pytest.approx(-seen["held"], rel=0.03)  # what the pelvis is held down with
-    assert 0.08 < seen["torque"].sum() / seen["floor"] < 0.22  # from the ankle to where toes press [m]
-
-
-def test_what_a_foot_presses_with_does_not_depend_on_its_damper(pressed):
+def test_a_blocked_foot_transmits_its_spring_whatever_its_damper(pressed):
+    # ``tau = K e``, and the floor pushes back at the lever of the foot.
+    for seen in pressed.values():
+        assert seen["speed"] < 0.02
+        assert seen["error"].min() > 0.05  # it is blocked
+        np.testing.assert_allclose(seen["torque"], 300.0 * seen["error"], rtol=0.03)
+        assert seen["floor"] == pytest.approx(-seen["held"], rel=0.03)  # what the pelvis is held down with
+        assert 0.08 < seen["torque"].sum() / seen["floor"] < 0.22  # from the ankle to where toes press [m]
     forces = [seen["floor"] for seen in pressed.values()]
     assert max(forces) < 1.05 * min(forces)
 
 
 @pytest.mark.parametrize("limit", [2.0, 15.0])
 def test_muscles_give_no_more_than_they_have(make_rig, limit):
-    """An arm is asked to rise by a spring that its weight and the limit do not let it follow."""
+    # An arm is asked to rise by a spring that its weight and the limit do not let it follow.
     shoulders = [joint_index("left_shoulder"), joint_index("right_shoulder")]
     held = Held(make_rig(cells=16, gravity=9.81), shoulders, 1000.0, 30.0)
     lower, upper = -EVERYWHERE.copy(), EVERYWHERE.copy()
@@ -120,7 +115,7 @@ def test_muscles_give_no_more_than_they_have(make_rig, limit):
 
 
 def test_no_muscle_gives_more_where_others_have_been_cut(make_rig):
-    """All joints are pulled to where they cannot get: what one does not give any more, its neighbours would have to."""
+    # All joints are pulled beyond their reach: what a muscle at its limit lacks, its neighbours would have to give.
     rng = np.random.default_rng(2)
     moving = [b for b in range(1, NUM_JOINTS) if b not in TOES]
     held = Held(make_rig(cells=16), moving, 300.0, 3.0)
@@ -148,7 +143,7 @@ def stop_at(local: wp.array(dtype=wp.quat), lower: wp.vec3, upper: wp.vec3, torq
 
 
 def test_the_end_of_a_range_gives_back_what_it_takes(device):
-    """Its torque is the gradient of half the square of how far a joint is beyond, however it is bent."""
+    # Its torque is the gradient of half the square of how far a joint is beyond, however it is bent.
     rng = np.random.default_rng(5)
     lower, upper = np.array([-0.2, -0.3, -0.1]), np.array([2.2, 0.2, 0.3])
     vectors = rng.uniform([-0.6, -0.8, -0.8], [2.4, 0.8, 0.8], (200, 3))
@@ -173,7 +168,7 @@ def test_the_end_of_a_range_gives_back_what_it_takes(device):
 
 
 def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
-    """A torque of 10 N m turns an elbow out of its range by what its stop gives, no further; it does not rebound."""
+    # A torque of 10 N m turns an elbow out of its range by what its stop gives, no further; it does not rebound.
     elbows = [joint_index("left_elbow"), joint_index("right_elbow")]
     held = Held(make_rig(cells=16), elbows, 0.0, 0.5)
     lower, upper, stop = -EVERYWHERE.copy(), EVERYWHERE.copy(), np.zeros(NUM_JOINTS)
@@ -216,17 +211,3 @@ def test_flesh_is_held_the_faster_the_deeper_it_lies():
     assert not attachment_rates(particles.depth, distance, nowhere, 0.0, 500.0).any()
     # depth is what sampling has measured: bone particles of the thigh lie deeper than its skin's
     assert particles.depth[particles.shell].max() < particles.depth[particles.bone == joint_index("left_hip")].mean()
-
-
-def test_muscles_are_mirrored_and_follow_their_factors():
-    lower, upper = joint_torques()
-    left, right = joint_index("left_elbow"), joint_index("right_elbow")
-    assert (lower[left, 0], upper[left, 0]) == (lower[right, 0], upper[right, 0])
-    assert (lower[left, 2], upper[left, 2]) == (-upper[right, 2], -lower[right, 2])
-    assert (lower <= 0.0).all() and (upper >= 0.0).all() and not lower[0].any()
-    one, other = make_muscles(), make_muscles(2.0, 3.0, 0.5)
-    np.testing.assert_allclose(other.stiffness, 2.0 * one.stiffness)
-    np.testing.assert_allclose(other.damping, 3.0 * one.damping)
-    np.testing.assert_allclose(other.upper, 0.5 * one.upper)
-    # Anderson et al., table 3: the knee extends with 0.163 of weight times height
-    assert -lower[joint_index("left_knee"), 0] == pytest.approx(0.163 * 75.0 * 9.81 * 1.75, rel=0.01)

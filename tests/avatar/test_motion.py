@@ -1,4 +1,4 @@
-"""The motion type against analytic rotations and paths, and clips against the ground."""
+"""The motion type against analytic rotations and paths; the ground; the embedded clips, for bodies of any size."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.motion import Motion, load_motion
+from piavatar_envs.avatar.motion import Motion, list_motions, load_motion
 from piavatar_envs.avatar.motion.deepmimic import lay_hands_on_ground
-from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights
-from piavatar_envs.avatar.motion.motion import hemisphere_consistent, slerp
+from piavatar_envs.avatar.motion.ground import lowest_heights
+from piavatar_envs.avatar.motion.library import list_embedded
 from piavatar_envs.avatar.motion.retarget import align_limbs, retarget
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -27,7 +27,7 @@ def clip(rotations: np.ndarray, root: np.ndarray | None = None, fps: float = 10.
 
 
 def spinning(joint: str, rotvec: np.ndarray, num_frames: int) -> np.ndarray:
-    """One joint turning at constant speed from 0 to ``rotvec``."""
+    """Return rotations of one joint that turns at constant speed from 0 to ``rotvec``."""
     rotations = still(num_frames)
     turn = Rotation.from_rotvec(np.linspace(0.0, 1.0, num_frames)[:, None] * rotvec)
     rotations[:, joint_index(joint)] = turn.as_quat(scalar_first=True)
@@ -35,7 +35,7 @@ def spinning(joint: str, rotvec: np.ndarray, num_frames: int) -> np.ndarray:
 
 
 def circling(num_frames: int = 7, heading: float = 0.5, loop: bool = True) -> Motion:
-    """Walking a circle of 2 m about (1, -1) by ``heading`` a round."""
+    """Return a walk on a circle of 2 m about (1, -1), by ``heading`` a round."""
     angle = np.linspace(0.0, heading, num_frames)
     rotations = still(num_frames)
     rotations[:, 0] = Rotation.from_rotvec(angle[:, None] * [0, 0, 1]).as_quat(scalar_first=True)
@@ -55,20 +55,6 @@ def test_sampling_a_constant_turn_is_the_exponential_map() -> None:
         expected = Rotation.from_rotvec(time / motion.duration * rotvec)
         assert (got * expected.inv()).magnitude() < 1e-12
         np.testing.assert_allclose(np.delete(rotations, joint_index("left_knee"), 0), still(1)[0, 1:], atol=1e-15)
-
-
-def test_slerp_takes_the_shorter_arc_whatever_the_signs() -> None:
-    start = np.array([1.0, 0.0, 0.0, 0.0])
-    end = -Rotation.from_euler("z", 90.0, degrees=True).as_quat(scalar_first=True)
-    middle = slerp(start, end, np.array(0.5))
-    np.testing.assert_allclose(middle, [np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8)], atol=1e-15)
-
-
-def test_quaternions_lie_in_one_hemisphere_after_construction() -> None:
-    rotations = spinning("head", np.array([0.0, 3.0, 0.0]), 20)
-    flipped = rotations * np.where(np.arange(20) % 3 == 0, -1.0, 1.0)[:, None, None]
-    np.testing.assert_array_equal(hemisphere_consistent(flipped), rotations)
-    np.testing.assert_allclose(clip(flipped).local_rotations, rotations, atol=1e-15)
 
 
 def test_a_motion_cannot_be_changed() -> None:
@@ -91,7 +77,7 @@ def test_a_clip_that_does_not_loop_holds_its_ends(time: float) -> None:
 
 @pytest.mark.parametrize("heading", [0.5, -0.9, 1e-3, 1e-11])
 def test_a_loop_goes_on_along_its_circle(heading: float) -> None:
-    """Frames of any round lie on the same circle, forwards and backwards in time."""
+    # Frames of any round lie on the same circle, forwards and backwards in time.
     motion = circling(heading=heading)
     for step in (-20, -6, -1, 0, 5, 6, 7, 13, 61, 600):
         rotations, root = motion.sample(step / motion.fps)
@@ -99,24 +85,6 @@ def test_a_loop_goes_on_along_its_circle(heading: float) -> None:
         np.testing.assert_allclose(root, [1 + 2 * np.cos(angle), -1 + 2 * np.sin(angle), 0.9], atol=1e-6)
         got = Rotation.from_quat(rotations[0], scalar_first=True)
         assert (got * Rotation.from_rotvec([0.0, 0.0, -angle])).magnitude() < 1e-8
-
-
-def test_a_loop_is_continuous_across_its_seam() -> None:
-    motion = circling()
-    before, after = (motion.sample(2 * motion.duration + dt) for dt in (-1e-7, 1e-7))
-    np.testing.assert_allclose(before[0], after[0], atol=1e-6)
-    np.testing.assert_allclose(before[1], after[1], atol=1e-6)
-
-
-def test_sampling_many_times_is_sampling_each() -> None:
-    motion = circling()
-    times = np.array([[-1.3, 0.0, 0.2], [0.6, 0.61, 9.0]])
-    rotations, root = motion.sample(times)
-    assert rotations.shape == (2, 3, NUM_JOINTS, 4) and root.shape == (2, 3, 3)
-    for index in np.ndindex(times.shape):
-        one = motion.sample(float(times[index]))
-        np.testing.assert_allclose(rotations[index], one[0], atol=1e-15)
-        np.testing.assert_allclose(root[index], one[1], atol=1e-15)
 
 
 def test_resampling_keeps_the_motion() -> None:
@@ -139,12 +107,6 @@ def test_resampling_a_loop_keeps_whole_rounds() -> None:
     assert odd.loop_heading == pytest.approx(motion.loop_heading, abs=1e-12)
 
 
-def test_resampling_a_single_pass_holds_the_last_pose() -> None:
-    motion = clip(still(4), np.linspace([0, 0, 0], [3.0, 0, 0], 4))
-    slower = motion.resample(4.0)  # 0.3 s are 1.2 frames: frames at 0, 0.25 and 0.5 s
-    np.testing.assert_allclose(slower.root_position[:, 0], [0.0, 2.5, 3.0], atol=1e-12)
-
-
 def test_a_clip_that_does_not_close_is_refused_as_a_loop_until_it_is_closed() -> None:
     rotations = spinning("left_elbow", np.array([0.0, 0.0, 0.3]), 31)
     root = np.linspace([0.0, 0.0, 1.0], [1.0, 0.0, 1.1], 31)
@@ -156,10 +118,6 @@ def test_a_clip_that_does_not_close_is_refused_as_a_loop_until_it_is_closed() ->
     np.testing.assert_allclose(closed.root_position[-1, 2], closed.root_position[0, 2], atol=1e-12)
     half = Rotation.from_quat(closed.local_rotations[0, joint_index("left_elbow")], scalar_first=True)
     np.testing.assert_allclose(half.as_rotvec(), [0.0, 0.0, 0.15], atol=1e-12)  # both ends come half the way
-
-
-def test_closing_can_take_the_turn_out_of_a_loop() -> None:
-    assert circling(loop=False, num_frames=31).closed(heading=0.0).loop_heading == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_mirrored_clip_moves_as_the_mirror_image() -> None:
@@ -179,9 +137,8 @@ def test_a_mirrored_clip_moves_as_the_mirror_image() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fps": 0.0}, r"fps=0\.0 is outside \(0, 1000\]"),
-        ({"fps": float("nan")}, "fps=nan"),
-        ({"local_rotations": still(3)[:, :21]}, r"shape \(3, 21, 4\), expected"),
+        ({"fps": 0.0}, r"fps=0\.0"),
+        ({"local_rotations": still(3)[:, :21]}, r"\(3, 21, 4\)"),
         ({"local_rotations": still(1), "root_position": np.zeros((1, 3))}, "at least 2 frames"),
         ({"root_position": np.zeros((4, 3))}, r"3 frames .*\(4, 3\)"),
         ({"root_position": np.array([[0, 0, 0], [0, np.inf, 0], [0, 0, 0]])}, r"root_position\[1, 1\] is inf"),
@@ -193,12 +150,9 @@ def test_malformed_clips_are_refused(change: dict, message: str) -> None:
     good = {"name": "bad", "fps": 30.0, "local_rotations": still(3), "root_position": np.zeros((3, 3))}
     with pytest.raises(ValueError, match=message):
         Motion(**{**good, **change})
-
-
-def test_times_and_rates_out_of_range_are_refused() -> None:
-    with pytest.raises(ValueError, match="time=nan s is not finite"):
+    with pytest.raises(ValueError, match="time=nan"):
         circling().sample(float("nan"))
-    with pytest.raises(ValueError, match=r"fps=-1.* \(0, 1000\]"):
+    with pytest.raises(ValueError, match="fps=-1"):
         circling().resample(-1.0)
 
 
@@ -206,7 +160,7 @@ def test_times_and_rates_out_of_range_are_refused() -> None:
 
 
 def test_the_ground_offset_puts_the_lowest_skin_on_the_ground() -> None:
-    """A turning body, skinned by brute force with every vertex."""
+    # A turning body, skinned by brute force with every vertex.
     body = load_asset()
     motion = clip(spinning("pelvis", np.array([2.0, 0.3, 0.0]), 5), np.linspace([0, 0, 3.0], [0, 1, 2.0], 5))
     grounded = motion.on_ground(body)
@@ -222,19 +176,8 @@ def test_the_ground_offset_puts_the_lowest_skin_on_the_ground() -> None:
     np.testing.assert_array_equal(grounded.root_position[:, :2], motion.root_position[:, :2])
 
 
-@pytest.mark.parametrize("loop", [False, True])
-def test_the_level_is_smooth_below_the_heights_and_ignores_short_flights(loop: bool) -> None:
-    time = np.arange(0, 121) / 60.0
-    drift = 0.05 * np.sin(2 * np.pi * time / 2.0) ** 2
-    flight = 0.6 * np.clip(1 - ((time - 1.0) / 0.2) ** 2, 0, None)  # 0.4 s off the ground
-    level = ground_level(drift + flight, 60.0, window=0.8, loop=loop)
-    assert (level <= drift + flight + 1e-12).all()
-    assert level.max() < 0.06
-    assert np.abs(np.diff(level)).max() * 60.0 < 0.2  # [m/s]
-
-
 def test_hands_lie_down_where_the_arms_stand_on_the_ground() -> None:
-    """Face down on straight vertical arms: the hand is bent to the level of the forearm's end, backwards."""
+    # Face down on straight vertical arms: the hand is bent to the level of the forearm's end, backwards.
     body = load_asset()
     rest = body.joints.astype(np.float64)
     wrists = (joint_index("left_wrist"), joint_index("right_wrist"))
@@ -255,7 +198,116 @@ def test_hands_lie_down_where_the_arms_stand_on_the_ground() -> None:
     np.testing.assert_allclose(laid.local_rotations[:, others], motion.local_rotations[:, others])
 
 
-def test_hands_in_the_air_are_left_alone() -> None:
-    motion = load_motion("arm_wave")
-    laid = lay_hands_on_ground(motion, load_asset(), None, window=0.5)
-    np.testing.assert_allclose(laid.local_rotations, motion.local_rotations, atol=1e-12)
+REST_POSE = np.tile([1.0, 0.0, 0.0, 0.0], (NUM_JOINTS, 1))
+
+
+def world_joints(motion: Motion) -> dict[str, np.ndarray]:
+    positions = motion.joint_frames(load_asset().joints)[1]
+    return {name: positions[:, joint] for joint, name in enumerate(JOINT_NAMES)}
+
+
+def bend(joints: dict[str, np.ndarray], start: str, middle: str, end: str) -> np.ndarray:
+    """Return the angle between two bones [deg], 0 when straight."""
+    a, b = joints[middle] - joints[start], joints[end] - joints[middle]
+    cosine = (a * b).sum(-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+@pytest.fixture(scope="module", params=list_embedded())
+def embedded(request: pytest.FixtureRequest) -> Motion:
+    return load_motion(request.param)
+
+
+def test_embedded_clips_start_and_end_at_rest(embedded: Motion) -> None:
+    assert embedded.name in list_motions()
+    assert embedded.loop and embedded.source == "procedural"
+    for frame in (0, -1):
+        np.testing.assert_allclose(embedded.local_rotations[frame], REST_POSE, atol=2e-3)
+        np.testing.assert_allclose(embedded.root_position[frame], load_asset().joints[0], atol=2e-3)
+
+
+def test_embedded_clips_are_smooth_and_human(embedded: Motion) -> None:
+    speed = embedded.joint_speeds()
+    assert speed.max() < 10.0  # [rad/s]
+    assert speed[[0, -1]].max() < 0.35  # at rest where the loop closes
+    assert np.abs(np.diff(speed, axis=0)).max() * embedded.fps < 120.0  # [rad/s^2] no kinks
+    joints = world_joints(embedded)
+    for side in ("left", "right"):
+        assert bend(joints, f"{side}_hip", f"{side}_knee", f"{side}_ankle").max() < 150.0
+        assert bend(joints, f"{side}_shoulder", f"{side}_elbow", f"{side}_wrist").max() < 150.0
+    for trunk in ("spine1", "spine2", "spine3", "neck", "head", "left_collar", "right_collar"):
+        turn = Rotation.from_quat(embedded.local_rotations[:, joint_index(trunk)], scalar_first=True)
+        assert turn.magnitude().max() < np.radians(30.0)
+
+
+def test_embedded_clips_stand_on_the_ground(embedded: Motion) -> None:
+    heights = lowest_heights(embedded, load_asset())
+    assert heights.min() == pytest.approx(0.0, abs=1e-6)
+    assert heights.max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "planted"),
+    [
+        *[(name, ("left_ankle", "right_ankle")) for name in ("arm_wave", "bow", "idle", "squat", "t_pose")],
+        ("kick", ("left_ankle",)),
+    ],
+)
+@pytest.mark.parametrize("sizes", [{}, {"height": -1.0}])
+def test_standing_feet_do_not_slide_whatever_the_size(name: str, planted: tuple[str, ...], sizes: dict) -> None:
+    asset = load_asset()
+    body = asset.shape(asset.parameters(**sizes))
+    motion = load_motion(name, asset, body)
+    positions = motion.joint_frames(body.joints)[1]
+    for ankle in planted:
+        path = positions[:, joint_index(ankle)]
+        np.testing.assert_allclose(path, np.tile(path[0], (len(path), 1)), atol=5e-3)
+
+
+def test_arm_wave_lifts_the_left_hand_on_the_side_of_positive_x() -> None:
+    joints = world_joints(load_motion("arm_wave"))
+    top = joints["left_wrist"][:, 2].argmax()
+    assert joints["left_wrist"][top, 2] > joints["head"][top, 2]
+    assert joints["left_wrist"][top, 0] > 0.2 > joints["right_wrist"][top, 0]
+    assert joints["right_wrist"][:, 2].max() < joints["right_shoulder"][:, 2].min()
+    across = joints["left_wrist"][:, 0][joints["left_wrist"][:, 2] > joints["head"][:, 2]]
+    turning_points = np.sum(np.diff(np.sign(np.diff(across))) != 0)
+    assert turning_points >= 3  # to and fro, more than once
+
+
+def test_squat_lowers_the_pelvis_with_the_knees_in_front() -> None:
+    motion = load_motion("squat")
+    joints = world_joints(motion)
+    low = motion.root_position[:, 2].argmin()
+    assert motion.root_position[0, 2] - motion.root_position[low, 2] > 0.3
+    for side in ("left", "right"):
+        assert joints[f"{side}_knee"][low, 1] < joints[f"{side}_hip"][low, 1] - 0.3  # forward is -y
+        assert joints[f"{side}_knee"][low, 1] < joints[f"{side}_ankle"][low, 1]
+
+
+def test_step_lifts_each_foot_while_the_other_stands() -> None:
+    joints = world_joints(load_motion("step"))
+    rise = {side: joints[f"{side}_ankle"][:, 2] - joints[f"{side}_ankle"][0, 2] for side in ("left", "right")}
+    for side, other in (("left", "right"), ("right", "left")):
+        top = rise[side].argmax()
+        assert rise[side][top] > 0.15 and abs(rise[other][top]) < 5e-3
+        standing = 1 if other == "left" else -1
+        assert standing * joints["pelvis"][top, 0] > 0.07  # the weight is over the foot that stands
+
+
+def test_kick_throws_the_right_foot_forward() -> None:
+    joints = world_joints(load_motion("kick"))
+    foot = joints["right_ankle"]
+    strike = foot[:, 1].argmin()
+    assert foot[strike, 1] < -0.6 and foot[strike, 2] > 0.45
+    assert foot[:strike, 1].max() > 0.25  # wound up behind before
+    assert bend(joints, "right_hip", "right_knee", "right_ankle")[strike] < 30.0
+
+
+def test_unknown_motions_are_refused(tmp_path) -> None:
+    with pytest.raises(ValueError, match="waltz"):
+        load_motion("waltz")
+    with pytest.raises((ValueError, ImportError), match="DeepMimic"):
+        load_motion("deepmimic:")
+    with pytest.raises(FileNotFoundError, match=r"walk\.npz"):
+        load_motion(tmp_path / "walk.npz")

@@ -1,15 +1,12 @@
-"""The drive as a whole: poses are reached without strain, and free bodies conserve what they should."""
+"""The pose controller as a whole: poses are reached without strain, and free bodies conserve what they should."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import kinematics
-from piavatar_envs.avatar.body.skeleton import forward_kinematics, joint_index
-from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.avatar.body.skeleton import joint_index
 
 #: Poses this wild, a new one each control step, need many substeps: hands move at 20 m/s.
 WILD, LIVELY = 0.6, 0.12
@@ -18,36 +15,8 @@ WILD, LIVELY = 0.6, 0.12
 # ---- kinematics
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.3, 1.0])
-def test_kernels_pose_the_body_like_numpy(make_rig, wild_pose, fraction):
-    """Forward kinematics with increments composed on the right, on arcs: ``R exp(fraction w)``."""
-    rng = np.random.default_rng(0)
-    rig = make_rig(num_envs=2, shapes=[{"height": 0.5}, {"height": -0.5}])
-    base, turn = (np.stack([wild_pose(rng, 0.9) for _ in range(2)]) for _ in range(2))
-    root, shift = rng.normal(size=(2, 2, 3))
-    inputs = [
-        wp.array(value.astype(np.float32), dtype=dtype, device=rig.model.device)
-        for value, dtype in ((rig.quaternions(base), wp.quat), (root, wp.vec3), (turn, wp.vec3), (shift, wp.vec3))
-    ]
-    rotation = wp.zeros((2, 22), dtype=wp.quat, device=rig.model.device)
-    position = wp.zeros((2, 22), dtype=wp.vec3, device=rig.model.device)
-    graph = LaunchGraph(rig.model.device)
-    threads = rig.avatar.threads
-    graph.launch(
-        kinematics.pose_body, (2, threads), [rig.avatar.body, fraction, *inputs, threads], [rotation, position]
-    )
-    graph.run()
-    for env in range(2):
-        local = (Rotation.from_rotvec(base[env]) * Rotation.from_rotvec(fraction * turn[env])).as_matrix()
-        world, joints = forward_kinematics(
-            local, root[env] + fraction * shift[env], rig.points.joints[env].astype(float)
-        )
-        np.testing.assert_allclose(Rotation.from_quat(rotation.numpy()[env]).as_matrix(), world, atol=2e-6)
-        np.testing.assert_allclose(position.numpy()[env], joints, atol=2e-6)
-
-
 def test_a_joint_moves_on_an_arc_at_constant_speed(make_rig):
-    """Halfway through the control step the hand is halfway along the arc, not on the chord."""
+    # Halfway through the control step the hand is halfway along the arc, not on the chord.
     rig = make_rig(num_substeps=20)
     pose = np.zeros((22, 3))
     pose[joint_index("left_shoulder"), 2] = 1.2
@@ -59,7 +28,7 @@ def test_a_joint_moves_on_an_arc_at_constant_speed(make_rig):
 
 
 def displaced(make_rig, wild_pose, **options):
-    """A body whose tracked pose is not the commanded one, as after a blow; limp, so that nothing pulls it back."""
+    """Return a limp body whose tracked pose is not the commanded one, as after a blow."""
     rng = np.random.default_rng(1)
     rig = make_rig(root="free", tone=0.0, alpha=0.0, decoupling="no_stress", num_substeps=60, **options)
     now, command, step = wild_pose(rng, 0.5), wild_pose(rng, 0.5), wild_pose(rng, 0.3)
@@ -101,9 +70,10 @@ def test_a_step_forward_is_a_step_where_the_body_faces(make_rig):
 # ---- reaching poses without strain
 
 
-@pytest.mark.parametrize("command", ["increment", "target"])
-@pytest.mark.parametrize("root", ["wrench", "free"])
-@pytest.mark.parametrize(("num_substeps", "scale", "frames"), [(15, LIVELY, 15), (100, WILD, 4)])
+@pytest.mark.parametrize(
+    ("command", "root", "num_substeps", "scale", "frames"),
+    [("increment", "wrench", 15, LIVELY, 15), ("target", "free", 15, LIVELY, 15), ("increment", "free", 100, WILD, 3)],
+)
 def test_random_poses_are_reached_and_strain_nothing(make_rig, wild_pose, command, root, num_substeps, scale, frames):
     rng = np.random.default_rng(2)
     rig = make_rig(command=command, root=root, num_substeps=num_substeps)
@@ -117,9 +87,9 @@ def test_random_poses_are_reached_and_strain_nothing(make_rig, wild_pose, comman
     assert rig.joint_errors().max() < 1e-4
 
 
-@pytest.mark.parametrize("settings", [{}, {"command": "target"}, {"free_motion": True}], ids=["add", "target", "free"])
+@pytest.mark.parametrize("settings", [{}, {"free_motion": True}], ids=["add", "free"])
 def test_strain_turns_with_the_bones(make_rig, wild_pose, settings):
-    """``Q F Q^T`` of flesh that one bone moves; unstrained flesh would not tell by what it is turned."""
+    # ``Q F Q^T`` of flesh that one bone moves; unstrained flesh would not show the turn.
     rig = make_rig(root="free", tone=0.0, alpha=0.0, decoupling="no_stress", num_substeps=60, **settings)
     stretch = np.diag([1.2, 0.9, 1.0])
     rig.state.F.assign(np.broadcast_to(stretch.reshape(9, 1), rig.state.F.shape).astype(np.float32).copy())
@@ -132,21 +102,8 @@ def test_strain_turns_with_the_bones(make_rig, wild_pose, settings):
     np.testing.assert_allclose(rig.read("F")[single], turned, atol=2e-4)
 
 
-def test_bodies_of_different_shape_reach_their_own_poses(make_rig, wild_pose):
-    rng = np.random.default_rng(3)
-    rig = make_rig(num_envs=2, shapes=[{"sex": 1.0, "weight": 0.8, "arms": 0.5}, {"height": -0.8, "belly": 0.5}])
-    assert np.abs(np.subtract(*rig.points.rest)).max() > 0.05
-    for _ in range(5):
-        poses = np.stack([wild_pose(rng, LIVELY) for _ in range(2)])
-        rig.command(poses, rig.points.joints[:, 0] + rng.normal(size=(2, 3)) * 0.03)
-        rig.step()
-        for env in range(2):
-            assert rig.pose_error(env).max() < 2e-4
-            np.testing.assert_allclose(rig.read("F", env), np.broadcast_to(np.eye(3), rig.read("F").shape), atol=1e-4)
-
-
 def test_the_papers_decoupling_is_worse_but_no_decoupling_is_worst(make_rig, wild_pose):
-    """The order of the paper's Table 1, with the split added: mean distance to the skinned target."""
+    # The order of the paper's Table 1, with the split added: mean distance to the skinned target.
     means = {}
     for decoupling in ("split", "paper", "none"):
         rng = np.random.default_rng(4)
@@ -160,9 +117,9 @@ def test_the_papers_decoupling_is_worse_but_no_decoupling_is_worst(make_rig, wil
     assert means["split"] < 1e-4 < 1e-3 < means["paper"] < 0.8 * means["none"]
 
 
-@pytest.mark.parametrize("velocity_lag", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("velocity_lag", [0.4, 1.0])
 def test_flesh_with_a_velocity_lag_misses_its_share_of_commanded_momentum(make_rig, velocity_lag):
-    """A root commanded to move at v gives the body the momentum ``(1 - lag) M v``."""
+    # A root commanded to move at v gives the body the momentum ``(1 - lag) M v``.
     rig = make_rig(root="free", tone=0.0, alpha=0.0)
     rig.avatar.body.velocity_lag.fill_(velocity_lag)
     velocity = np.array([0.3, -0.2, 0.0])
@@ -176,7 +133,7 @@ def test_flesh_with_a_velocity_lag_misses_its_share_of_commanded_momentum(make_r
 
 
 def gesture(k: int, size: float = 0.8) -> np.ndarray:
-    """A pose of a lopsided swing of arm, leg and trunk, one cycle a second."""
+    """Return a pose of a lopsided swing of arm, leg and trunk, one cycle a second."""
     pose, s = np.zeros((22, 3)), size * np.sin(2.0 * np.pi * k / 30.0)
     pose[joint_index("left_shoulder"), 1] = pose[joint_index("left_elbow"), 2] = s
     pose[joint_index("right_hip"), 0] = -s
@@ -207,7 +164,7 @@ def test_commanded_motion_of_a_free_body_carries_no_momentum(make_rig):
 
 
 def test_moving_limbs_do_not_disturb_a_flying_body(make_rig):
-    """Contact-carried targets: without the motion G the shape is 50 mm off at 4 m/s, with it nothing."""
+    # Contact-carried targets: without the motion G the shape is 50 mm off at 4 m/s, with it nothing.
     rig = make_rig(root="free", free_motion=True, room=1.9)
     rig.set_rigid_velocity((0.0, -4.0, 0.0), (0.0, 0.0, 0.0))
     for k in range(1, 9):
@@ -220,19 +177,8 @@ def test_moving_limbs_do_not_disturb_a_flying_body(make_rig):
     np.testing.assert_allclose(spin, 0.0, atol=2e-4)
 
 
-def test_limbs_move_as_commanded_on_a_flying_body_that_is_not_free(make_rig):
-    rig = make_rig(root="free", room=1.9)
-    rig.set_rigid_velocity((0.0, -4.0, 0.0), (0.0, 0.0, 0.0))
-    for k in range(1, 9):
-        rig.command(gesture(k))
-        rig.step()
-        assert rig.shape_error().max() < 1e-4
-    assert np.degrees(rig.joint_errors().max()) < 0.02
-
-
-@pytest.mark.parametrize("tone", [0.0, 1.0])
-def test_a_drifting_body_keeps_its_velocity(make_rig, tone):
-    rig = make_rig(root="free", tone=tone)
+def test_a_drifting_body_keeps_its_velocity(make_rig):
+    rig = make_rig(root="free", tone=1.0, alpha=1.0)
     rig.set_rigid_velocity((0.3, -1.2, 0.4), (0.0, 0.0, 0.0))
     before, start = rig.totals(), center_of(rig)
     rig.step(20)
@@ -255,8 +201,8 @@ def test_a_tumbling_body_keeps_its_angular_momentum(make_rig, tone):
     assert 0.9 * energy < rig.energy() <= energy
 
 
-def test_a_skater_who_draws_in_the_arms_spins_faster(make_rig):
-    """Angular momentum is kept while commanded motion changes the inertia: ``I1 w1 = I0 w0``."""
+def test_arms_drawn_in_make_a_spin_faster(make_rig):
+    # Angular momentum is kept while commanded motion changes the inertia: ``I1 w1 = I0 w0``.
     rig = make_rig(root="free", free_motion=True)
     out, down = np.zeros((22, 3)), np.zeros((22, 3))
     for side, sign in (("left", 1.0), ("right", -1.0)):

@@ -34,7 +34,7 @@ def test_an_amount_out_of_range_is_refused(amount):
 
 
 def lag(device: str, amount: float) -> np.ndarray:
-    """How far soft flesh is from its skinned place over a squat [m], relative to the hard flesh beside it."""
+    """Return the mean distance of soft flesh from its skinned place over a squat [m]."""
     task = load_task("TrackMotion-v0")
     settings = {"motion": "squat", "impulse": 0.0, "random_start": False, "root_action": False}
     settings |= {"soft_tissue": amount, "soft_young_modulus": 5.0e3, "fidelity": "tiny"}

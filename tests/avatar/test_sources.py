@@ -12,7 +12,8 @@ import pytest
 import piavatar_envs
 from piavatar_envs.avatar.body.sources import list_sources, load_asset
 from piavatar_envs.avatar.motion import list_motions, load_motion
-from piavatar_envs.config import ConfigError
+from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.sim.world import Simulation
 
 REACH, TRACK = "PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"
 
@@ -42,7 +43,7 @@ register_motion("shrug", shrug)
 
 @pytest.fixture(scope="module", autouse=True)
 def registered(tmp_path_factory):
-    """A module outside the package that registers a source and a motion."""
+    """Load a module outside the package that registers a source and a motion."""
     file = tmp_path_factory.mktemp("own") / "own_bodies.py"
     file.write_text(MODULE)
     spec = importlib.util.spec_from_file_location("own_bodies", file)
@@ -82,6 +83,30 @@ def test_each_avatar_of_a_scene_may_have_a_source_of_its_own(device):
     world.close()
 
 
+def test_random_shapes_are_refused_where_sources_have_other_parameters(device):
+    # The parameters of one body would be observed under the names of another.
+    asset = load_asset()
+    names = tuple(f"own_{name}" for name in asset.shape_names)
+    piavatar_envs.register_source("renamed", lambda: dataclasses.replace(asset, shape_names=names))
+    avatars = [{}, {"position": [1.0, 0.0], "avatar": {"source": "renamed"}}]
+    for shape in ({"randomize": True}, {"randomize": True, "pool": 2}):
+        settings = {"fidelity": "tiny", "shape": shape, "scene": {"avatars": avatars}}
+        with pytest.raises(ConfigError, match=r"shape\.randomize=True.*avatar\.source"):
+            Simulation(load_config(EnvConfig, None, settings), 1, device)
+
+
+def test_shapes_of_one_source_are_drawn_under_its_own_names(device):
+    asset = load_asset()
+    names = tuple(f"own_{name}" for name in asset.shape_names)
+    piavatar_envs.register_source("renamed", lambda: dataclasses.replace(asset, shape_names=names))
+    env = make(REACH, device, avatar={"source": "renamed"}, shape={"randomize": True}, observe_parameters=True)
+    env.reset(seed=0)
+    found = [p.name for p in env.batch.layout["parameters"].parameters]
+    assert set(found) >= {f"shape_{name}" for name in names}
+    assert np.ptp(env.batch.simulation.flesh[0].shape_parameters) > 0.1
+    env.close()
+
+
 def test_a_source_reads_the_file_that_it_is_given(tmp_path):
     file = tmp_path / "factor.txt"
     file.write_text("0.5")
@@ -90,15 +115,15 @@ def test_a_source_reads_the_file_that_it_is_given(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
-        ({"source": "nobody"}, "avatar.source='nobody'.*embedded, scaled"),
+        ({"source": "none"}, "avatar.source='none'.*embedded, .*scaled"),
         ({"path": "body.glb"}, "avatar.*embedded.*body.glb"),
         ({"source": "scaled", "path": "missing.txt"}, "avatar.*missing.txt"),
     ],
 )
-def test_bad_sources_are_refused(device, settings, told):
-    with pytest.raises(ConfigError, match=told):
+def test_bad_sources_are_refused(device, settings, message):
+    with pytest.raises(ConfigError, match=message):
         make(REACH, device, avatar=settings)
 
 
@@ -111,6 +136,8 @@ def test_names_and_functions_are_checked():
     piavatar_envs.register_source("broken", lambda: {})
     with pytest.raises(TypeError, match="AvatarAsset"):
         load_asset("broken")
+    piavatar_envs.register_source("broken", load_asset)  # registered again, it is replaced
+    assert load_asset("broken") is load_asset()
 
 
 def test_an_environment_tracks_a_registered_motion(device):
@@ -121,11 +148,3 @@ def test_an_environment_tracks_a_registered_motion(device):
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert info["failure"] is None
     env.close()
-
-
-def test_an_asset_is_replaced_by_name():
-    asset = load_asset()
-    piavatar_envs.register_source("renamed", lambda: dataclasses.replace(asset, name="first"))
-    assert load_asset("renamed").name == "first"
-    piavatar_envs.register_source("renamed", lambda: dataclasses.replace(asset, name="second"))
-    assert load_asset("renamed").name == "second"

@@ -12,10 +12,9 @@ from piavatar_envs.avatar.body import device as body_device
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
 from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED
-from piavatar_envs.avatar.torque_control.mass_matrix import LONGEST_REFRESH, MOST_USES, NUM_DOF
+from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.torque_control.stages import FIT_SHARE
 from piavatar_envs.core import cuda_intrinsics as lanes
-from piavatar_envs.core.launch_graph import LaunchGraph
 from tests.avatar.articulated import GAINS, Joints, carried_by, momentum_of
 
 TOES = [joint_index("left_foot"), joint_index("right_foot")]
@@ -23,7 +22,7 @@ TOES = [joint_index("left_foot"), joint_index("right_foot")]
 
 @pytest.fixture
 def joints(make_rig, wild_pose):
-    """Joints in a wild pose, particles shaken about it, in random motion."""
+    """Return joints in a wild pose, particles shaken about it, in random motion."""
 
     def build(seed=0, **gains) -> Joints:
         rng = np.random.default_rng(seed)
@@ -37,7 +36,7 @@ def joints(make_rig, wild_pose):
     return build
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_mass_matrix_is_that_of_the_jacobian(joints, seed):
     made = joints(seed)
     J, m = made.jacobian, made.rig.mass
@@ -47,20 +46,8 @@ def test_mass_matrix_is_that_of_the_jacobian(joints, seed):
     assert np.linalg.eigvalsh(made.mass).min() > 0.0
 
 
-def test_a_control_step_has_a_mass_matrix_for_every_two_substeps(joints):
-    """At most; only its first substep looks where joints have been put, and all go over the particles twice."""
-    made = joints()
-    assert made.body.mass.refresh * made.model.step.dt <= LONGEST_REFRESH and made.body.mass.refresh <= MOST_USES
-    made.body.mass.refresh, graph = 2, LaunchGraph(made.model.device)
-    for step in range(5):
-        made.body.record_substep(graph, made.state, made.rig.scratch, step)
-    alone = ["attach_flesh", "act", "split_velocity"]
-    own = ["attach_flesh", "sum_pairs", "build_mass", "act", "split_velocity"]
-    assert graph.names == ["begin_substep", *own, *alone, *own, *alone, *own]
-
-
 def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
-    """``(M + I) dq = J^T m v``; they move with ``J dq`` half a step on, and what is left is physical."""
+    # ``(M + I) dq = J^T m v``; they move with ``J dq`` half a step on, and what is left is physical.
     made = joints()
     made.state.u.assign(0.5 * made.state.u.numpy())  # half a step turns joints by 0.09 rad at most
     before, J, m = made.total, made.jacobian, made.rig.mass
@@ -83,7 +70,7 @@ def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
 
 @pytest.mark.parametrize("attachment", [None, 200.0])
 def test_particles_go_from_skinned_places_to_skinned_places(make_rig, wild_pose, attachment):
-    """Where a wild pose bends the joints, too: there ``J qdot`` alone, at a particle, is another velocity."""
+    # Where a wild pose bends the joints, too: there ``J qdot`` alone, at a particle, is another velocity.
     rng = np.random.default_rng(2)
     made = Joints(make_rig(cells=16), attachment=attachment).pose(wild_pose(rng))
     velocity = rng.normal(0.0, 3.0, NUM_DOF)
@@ -105,7 +92,7 @@ def test_particles_go_from_skinned_places_to_skinned_places(make_rig, wild_pose,
 
 @pytest.mark.parametrize("stale", [False, True], ids=["fresh", "stale"])
 def test_torques_change_neither_momentum(joints, wild_pose, stale):
-    """Springs, dampers, torques of 1000 N m, flesh on bones; also with a mass matrix of another place."""
+    # Springs, dampers, torques of 1000 N m, flesh on bones; also with a mass matrix of another place.
     made = joints(1, stiffness=300.0, damping=10.0, attachment=200.0)
     rng = np.random.default_rng(3)
     if stale:
@@ -121,7 +108,7 @@ def test_torques_change_neither_momentum(joints, wild_pose, stale):
 
 
 def test_torque_turns_a_joint_as_the_inertia_says(joints):
-    """Without springs ``M d = dt tau``, in the frame of the upper arm; compared in double precision."""
+    # Without springs ``M d = dt tau``, in the frame of the upper arm; compared in double precision.
     made = joints(2)
     made.state.u.zero_()
     elbow = joint_index("left_elbow")
@@ -140,7 +127,7 @@ def test_torque_turns_a_joint_as_the_inertia_says(joints):
 
 
 def off_their_places(made, rotvec, rng) -> tuple[np.ndarray, np.ndarray]:
-    """Put particles where another pose near by has them; rotations of that, ``(22, 3, 3)``, and its place [m]."""
+    """Put particles where a pose near by has them; return its rotations, ``(22, 3, 3)``, and its place [m]."""
     turned = Rotation.from_rotvec(rotvec) * Rotation.from_rotvec(rng.normal(0.0, 0.02, rotvec.shape))
     root = made.body.state.position.numpy()[0, 0] + (0.01, -0.02, 0.015)
     made.state.x.assign(made.rig.skinned(turned.as_matrix(), root)[None].astype(np.float32))
@@ -148,7 +135,7 @@ def off_their_places(made, rotvec, rng) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_pose_is_fitted_to_particles_that_rest(joints, wild_pose):
-    """In many substeps, for each takes a share, and a smaller one where the grid's inertia is the larger one."""
+    # In many substeps, for each takes a share, and a smaller one where the grid's inertia is the larger one.
     rng = np.random.default_rng(5)
     rotvec = wild_pose(rng)
     made = Joints(joints(0).rig).pose(rotvec)
@@ -165,23 +152,9 @@ def test_the_pose_is_fitted_to_particles_that_rest(joints, wild_pose):
         assert not velocity.numpy().any()
 
 
-def test_a_fit_keeps_velocities(joints, wild_pose):
-    """Nothing drives the joints: what a new pose makes of their velocities is handed back."""
-    rng = np.random.default_rng(5)
-    rotvec = wild_pose(rng)
-    made = Joints(joints(0).rig).pose(rotvec)
-    made.state.u.assign(rng.normal(0.0, 1.0, made.state.x.numpy().shape).astype(np.float32))
-    made.body.state.velocity.assign(rng.normal(0.0, 1.0, (1, NUM_DOF)).astype(np.float32))
-    off_their_places(made, rotvec, rng)
-    before, graph = made.total, made.substep(0)
-    for _ in range(10):
-        graph.run()
-        np.testing.assert_allclose(made.total, before, atol=5e-5)
-
-
 @pytest.mark.parametrize("speed", [0.0, 10.0], ids=["resting", "flying"])
 def test_a_fit_takes_a_share_of_the_displacement(joints, wild_pose, speed):
-    """``(M + I) dq = J^T m (x - LBS)``, wherever the body flies; the next substep has no matrix, and no fit."""
+    # ``(M + I) dq = J^T m (x - LBS)``, wherever the body flies; the next substep has no matrix, and no fit.
     rng = np.random.default_rng(6)
     rotvec, flight = wild_pose(rng), speed * np.array([0.6, 0.0, 0.8])
     made = Joints(joints(0).rig).pose(rotvec)
@@ -205,7 +178,7 @@ def test_a_fit_takes_a_share_of_the_displacement(joints, wild_pose, speed):
 
 
 def test_a_mode_swings_at_its_frequency(make_rig):
-    """Small swings of the softest springs: ``K x = omega^2 M x``, in a body that nothing holds."""
+    # Small swings of the softest springs: ``K x = omega^2 M x``, in a body that nothing holds.
     made = Joints(make_rig(cells=16), stiffness=60.0).pose(np.zeros((NUM_JOINTS, 3)))
     M = made.mass
     K = np.diag(np.r_[np.zeros(6), np.full(NUM_DOF - 6, 60.0)])
@@ -227,28 +200,8 @@ def test_a_mode_swings_at_its_frequency(make_rig):
     np.testing.assert_allclose(swing, expected, atol=0.03)
 
 
-def test_free_float_keeps_momentum(make_rig, wild_pose):
-    """A body that flails in empty space, springs and flesh together: the drift is small against the sum of m |v|."""
-    rig = make_rig(cells=16)
-    made = Joints(rig, stiffness=100.0, damping=3.0).pose(np.zeros((NUM_JOINTS, 3)))
-    rng = np.random.default_rng(7)
-    graph = made.control_step()
-    start = rig.totals()
-    largest, worst = 0.0, np.zeros(2)
-    for _ in range(6):
-        made.body.target.rotation.assign(Rotation.from_rotvec(0.6 * wild_pose(rng)).as_quat()[None].astype(np.float32))
-        graph.run()
-        now = rig.totals()  # with the affine part of the angular momentum
-        largest = max(largest, made.momenta()[2])
-        changes = now.momentum - start.momentum, now.angular_momentum - start.angular_momentum
-        worst = np.maximum(worst, [np.linalg.norm(change) for change in changes])
-    assert rig.state.failure.numpy().sum() == 0
-    assert largest > 10.0  # it did move [kg m/s]
-    assert (worst < 1e-5 * largest).all(), worst / largest
-
-
 def test_flesh_comes_back_to_the_bones(make_rig):
-    """Displaced flesh in empty space: at a rate of 100/s nothing is left of it after 0.4 s."""
+    # Displaced flesh in empty space: at a rate of 100/s nothing is left of it after 0.4 s.
     made = Joints(make_rig(cells=16), stiffness=300.0, damping=10.0, attachment=100.0)
     nothing, everywhere = np.zeros(NUM_JOINTS), np.full((NUM_JOINTS, 3), UNBOUNDED)
     made.body.set_tissue(nothing, nothing, -everywhere, everywhere, TOES)  # too light for so large cells
@@ -269,31 +222,8 @@ def test_flesh_comes_back_to_the_bones(make_rig):
 
 
 @pytest.mark.parametrize("attachment", [None, 100.0])
-def test_threads_that_have_several_particles_move_as_one_each_does(joints, monkeypatch, attachment):
-    """On a GPU, in batches that leave no thread idle."""
-
-    def moved():
-        made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
-        graph = made.substep(0)
-        graph.run()
-        graph.run()
-        return made
-
-    one = moved()
-    particles = one.rig.points.num_points
-    if not wp.get_device(one.model.device).is_cuda:
-        pytest.skip("on a CPU one thread has all particles")
-    monkeypatch.setattr(lanes, "RESIDENT", 1)
-    assert lanes.particle_rounds(one.model.device, particles) > 1
-    several = moved()
-    for name, value in one.state.numpy().items():
-        np.testing.assert_array_equal(several.state.numpy()[name], value, err_msg=name)
-    assert np.ptp(one.state.u.numpy()) > 0.1
-
-
-@pytest.mark.parametrize("attachment", [None, 100.0])
-def test_a_body_in_many_parts_moves_as_in_one(joints, monkeypatch, attachment):
-    """The same sums in another order; parts end within the particles of a warp and of a bone."""
+def test_threads_and_partitions_change_nothing(joints, monkeypatch, attachment):
+    # Threads that have several particles each give the same bits; bodies in many partitions sum in another order.
 
     def moved():
         made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
@@ -302,6 +232,13 @@ def test_a_body_in_many_parts_moves_as_in_one(joints, monkeypatch, attachment):
         return made
 
     whole = moved()
+    if wp.get_device(whole.model.device).is_cuda:  # on a CPU one thread has all particles
+        with monkeypatch.context() as patch:
+            patch.setattr(lanes, "RESIDENT", 1)
+            assert lanes.particle_rounds(whole.model.device, whole.rig.points.num_points) > 1
+            several = moved()
+        for name, value in whole.state.numpy().items():
+            np.testing.assert_array_equal(several.state.numpy()[name], value, err_msg=name)
     monkeypatch.setattr(body_device, "partition_size", lambda device, count: 100)
     divided = moved()
     assert divided.body.body.chunk_bone.shape[0] > whole.body.body.chunk_bone.shape[0]
@@ -313,26 +250,22 @@ def test_a_body_in_many_parts_moves_as_in_one(joints, monkeypatch, attachment):
     np.testing.assert_allclose(divided.body.state.velocity.numpy(), speed, atol=2e-5 * np.abs(speed).max())
 
 
-@pytest.mark.parametrize("name", ["stiffness", "damping"])
-@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
-def test_bad_gains_are_refused(make_rig, name, bad):
+def test_bad_gains_are_refused(make_rig):
     rig = make_rig(cells=16)
-    gains = {"stiffness": GAINS.copy(), "damping": GAINS.copy()}
-    gains[name][0, 3] = bad
-    with pytest.raises(ValueError, match=f"{name} must be finite and not negative"):
-        ArticulatedBody(rig.points, rig.avatar.body, rig.model, **gains)
-    with pytest.raises(ValueError, match=f"{name} has shape"):
-        ArticulatedBody(rig.points, rig.avatar.body, rig.model, **{**gains, name: np.ones(3)})
-
-
-def test_firm_particles_are_those_of_the_body(make_rig):
-    rig = make_rig(cells=16)
-    with pytest.raises(ValueError, match=r"firm has shape \(3,\), expected \(\d+,\)"):
-        ArticulatedBody(rig.points, rig.avatar.body, rig.model, GAINS, GAINS, firm=np.ones(3, bool))
+    good, negative, missing = {"stiffness": GAINS, "damping": GAINS}, GAINS.copy(), GAINS.copy()
+    negative[0, 3], missing[0, 3] = -1.0, np.nan
+    for name, bad in (
+        ("stiffness", negative),
+        ("damping", missing),
+        ("damping", np.ones(3)),
+        ("firm", np.ones(3, bool)),
+    ):
+        with pytest.raises(ValueError, match=name):
+            ArticulatedBody(rig.points, rig.avatar.body, rig.model, **{**good, name: bad})
 
 
 def test_a_held_pelvis_bears_the_weight(make_rig):
-    """Springs of the pelvis carry a body at rest: with stiff joints it sinks by ``m g / K``, and stays."""
+    # Springs of the pelvis carry a body at rest: with stiff joints it sinks by ``m g / K``, and stays.
     rig = make_rig(cells=16, gravity=9.81)
     stiffness, damping = 3000.0 * GAINS, 100.0 * GAINS
     stiffness[0, :2], damping[0, :2] = (2e4, 1e4), (2e3, 1e3)

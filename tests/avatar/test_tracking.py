@@ -20,7 +20,7 @@ def fit_rotations(H: wp.array(dtype=wp.mat33), R: wp.array(dtype=wp.mat33)):
 
 
 def fit(H: np.ndarray, device: str) -> np.ndarray:
-    """Rotations of correlations ``(N, 3, 3)``, by the code under test."""
+    """Return rotations of correlations ``(N, 3, 3)``, by the code under test."""
     source = wp.array(np.ascontiguousarray(H, np.float32), dtype=wp.mat33, device=device)
     out = wp.zeros(len(H), dtype=wp.mat33, device=device)
     wp.launch(fit_rotations, len(H), [source], [out], device=device)
@@ -28,7 +28,7 @@ def fit(H: np.ndarray, device: str) -> np.ndarray:
 
 
 def reference(H: np.ndarray) -> np.ndarray:
-    """Kabsch 1978 in double precision, with the explicit reflection fix."""
+    """Return the fit of Kabsch 1978 in double precision, with the explicit reflection fix."""
     U, _, Vt = np.linalg.svd(H.astype(np.float32).astype(float))
     flip = np.tile(np.eye(3), (len(H), 1, 1))
     flip[:, 2, 2] = np.sign(np.linalg.det(U @ Vt))
@@ -41,7 +41,7 @@ def correlation(moved: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def angle(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Angle between rotations [rad]."""
+    """Return the angle between rotations [rad]."""
     return Rotation.from_matrix(np.swapaxes(A, -1, -2) @ B).magnitude()
 
 
@@ -51,7 +51,7 @@ def assert_proper(R: np.ndarray) -> None:
 
 
 def random_motions(rng: np.random.Generator, count: int = 200, points: int = 20, flat: float = 1.0):
-    """Rest points, rotations, moved points."""
+    """Return rest points, rotations and moved points."""
     rest = rng.normal(size=(count, points, 3)) * [1.0, 1.0, flat]
     R = Rotation.random(count, random_state=rng).as_matrix()
     return rest, R, rest @ np.swapaxes(R, -1, -2) + rng.normal(size=(count, 1, 3))
@@ -63,7 +63,7 @@ def test_rigid_motion_is_recovered(device):
     assert angle(fit(correlation(moved, rest), device), R).max() < ROUND_OFF
 
 
-@pytest.mark.parametrize("scale", [1e-12, 1e-5, 2e-5, 1.0, 1e9])
+@pytest.mark.parametrize("scale", [1e-12, 2e-5, 1e9])
 def test_size_of_the_correlation_does_not_matter(device, scale):
     # wp.svd3 itself errs by tens of degrees at traces near 2e-5
     rest, R, moved = random_motions(np.random.default_rng(1))
@@ -72,24 +72,18 @@ def test_size_of_the_correlation_does_not_matter(device, scale):
     assert angle(fit(H, device), R).max() < ROUND_OFF
 
 
-def test_planar_points_have_one_proper_rotation(device):
+def test_planar_and_collinear_points_have_proper_rotations(device):
     rest, R, moved = random_motions(np.random.default_rng(2), flat=0.0)
     fitted = fit(correlation(moved, rest), device)
     assert_proper(fitted)
     assert angle(fitted, R).max() < 10 * ROUND_OFF
-
-
-def test_collinear_points_keep_their_direction(device):
     rng = np.random.default_rng(3)
     rest, R, _ = random_motions(rng)
     rest = rest * [1.0, 0.0, 0.0]
     fitted = fit(correlation(rest @ np.swapaxes(R, -1, -2), rest), device)
     assert_proper(fitted)
     np.testing.assert_allclose(fitted[:, :, 0], R[:, :, 0], atol=1e-5)
-
-
-def test_no_points_at_all_give_a_proper_rotation(device):
-    assert_proper(fit(np.zeros((1, 3, 3)), device))
+    assert_proper(fit(np.zeros((1, 3, 3)), device))  # of no points at all
 
 
 def test_reflected_points_get_the_best_proper_rotation(device):
@@ -111,15 +105,13 @@ def test_reflected_points_get_the_best_proper_rotation(device):
 
 
 def test_noise_in_the_points_becomes_noise_in_the_rotation(device):
-    """To first order the error's variance is ``3 sigma^2 / (2 n)`` for ``n`` isotropic points of unit spread."""
-    rng = np.random.default_rng(5)
-    errors = {}
+    # To first order the error's variance is ``3 sigma^2 / (2 n)`` for ``n`` isotropic points of unit spread.
+    rng, sigma = np.random.default_rng(5), 1e-2
     for points in (18, 72):
-        for sigma in (1e-3, 1e-2):
-            rest, R, moved = random_motions(rng, count=1500, points=points)
-            H = correlation(moved + sigma * rng.normal(size=moved.shape), rest)
-            errors[points, sigma] = np.sqrt((angle(fit(H, device), R) ** 2).mean())
-            assert errors[points, sigma] == pytest.approx(sigma * np.sqrt(3.0 / (2.0 * points)), rel=0.15)
+        rest, R, moved = random_motions(rng, count=1500, points=points)
+        H = correlation(moved + sigma * rng.normal(size=moved.shape), rest)
+        error = np.sqrt((angle(fit(H, device), R) ** 2).mean())
+        assert error == pytest.approx(sigma * np.sqrt(3.0 / (2.0 * points)), rel=0.15)
 
 
 def test_all_bones_of_a_moved_body_report_that_motion(make_rig):
@@ -146,23 +138,11 @@ def test_tracked_velocity_is_that_of_the_bones_particles(make_rig):
     np.testing.assert_allclose(rig.avatar.tracked.velocity.numpy()[0], expected, atol=1e-6)
 
 
-def test_a_batch_tracks_as_single_environments_do(make_rig, wild_pose):
-    rng = np.random.default_rng(8)
-    poses = np.stack([wild_pose(rng) for _ in range(3)])
-    batch = make_rig(num_envs=3).reset(poses)
-    for env in range(3):
-        single = make_rig().reset(poses[env])
-        for name in ("rotation", "position", "local"):
-            one, many = (getattr(rig.avatar.tracked, name).numpy() for rig in (single, batch))
-            np.testing.assert_array_equal(one[0], many[env])
-
-
-@pytest.mark.parametrize("scale", [0.3, 0.9])
-def test_tracked_pose_equals_the_commanded_pose_after_a_reset(make_rig, wild_pose, scale):
+def test_tracked_pose_equals_the_commanded_pose_after_a_reset(make_rig, wild_pose):
     rng = np.random.default_rng(9)
     rig = make_rig()
     for _ in range(5):
-        pose = wild_pose(rng, scale)
+        pose = wild_pose(rng, 0.9)
         rig.reset(pose, root=(0.1, -0.2, 1.0))
         command = Rotation.from_rotvec(pose)
         assert (command.inv() * Rotation.from_matrix(rig.tracked_local())).magnitude().max() < 1e-5

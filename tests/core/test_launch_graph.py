@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
+from piavatar_envs.core.launch_graph import LaunchGraph
 from tests.gpu_on_cpu import NAME as GPU_ON_CPU
 
 
@@ -63,28 +63,13 @@ def test_branches_of_a_graph_with_a_condition(device, holds):
 
 
 def test_a_section_waits_for_the_one_before(device):
-    """Though nothing is launched between them; the branches of the second begin where those of the first had ended."""
+    # Though nothing is launched between them; the branches of the second begin where those of the first had ended.
     graph, branched = LaunchGraph(device), Branched(device)
     graph.parallel(branched.branch(branched.a, 0), branched.branch(branched.b, 100_000))
     graph.parallel(branched.branch(branched.b, 0), branched.branch(branched.a, 0))
     graph.run()
-    assert [(launch.section, launch.branch) for launch in graph._launches] == [
-        (section, branch) for section in (1, 2) for branch in (0, 0, 1, 1)
-    ]
     np.testing.assert_array_equal(branched.a.numpy(), np.full(64, 16 + 15))
     np.testing.assert_array_equal(branched.b.numpy(), np.full(64, 160 + 15))
-
-
-def test_empty_branches_are_dropped(device):
-    graph, one, none = LaunchGraph(device), LaunchGraph(device), LaunchGraph(device)
-    values = wp.zeros(4, dtype=int, device=device)
-    one.launch(double, 4, [values, 0], block_dim=32)
-    graph.parallel(none, one)
-    graph.parallel(one, none)
-    graph.parallel(none, LaunchGraph(device))
-    graph.launch(double, 4, [values, 0], block_dim=32)
-    graph.run()
-    np.testing.assert_array_equal(values.numpy(), [7, 7, 7, 7])
 
 
 def test_bad_branches_are_refused(device):
@@ -115,7 +100,7 @@ def reset(condition: wp.array(dtype=int)):
 
 
 def test_a_condition_skips_the_graph(device):
-    """The condition is read once, before the first launch: the graph itself may change it."""
+    # The condition is read once, before the first launch: the graph itself may change it.
     if wp.get_device(device).is_cuda and device != GPU_ON_CPU and not wp.is_conditional_graph_supported():
         pytest.skip("graphs of this CUDA have no branches")
     condition, runs = wp.zeros(1, dtype=int, device=device), wp.zeros(3, dtype=int, device=device)
@@ -131,26 +116,6 @@ def test_a_condition_skips_the_graph(device):
     condition.assign(np.array([1], np.int32))
     graph.run_eager()
     assert runs.numpy().tolist() == [3] * 3 and condition.numpy()[0] == 0
-
-
-def test_graphs_are_compiled_together(device, monkeypatch):
-    """A module is loaded once for all graphs that use it; launches appended later are compiled with the first run."""
-    loaded, load = [], wp.load_module
-    monkeypatch.setattr(wp, "load_module", lambda m, *args, **kwargs: loaded.append(m) or load(m, *args, **kwargs))
-    runs, condition = wp.zeros(3, dtype=int, device=device), wp.ones(1, dtype=int, device=device)
-    first, second = LaunchGraph(device), LaunchGraph(device)
-    for graph in (first, second):
-        graph.launch(count_runs, 3, [], [runs])
-        graph.launch(reset, 1, [], [condition])
-    compile_graphs([first, second])
-    assert loaded == [count_runs.module] and not first.unbound and not second.unbound
-    compile_graphs([first, second])
-    assert len(loaded) == 1
-    first.launch(count_runs, 3, [], [runs])
-    assert len(first.unbound) == 1
-    first.run()
-    second.run()
-    assert runs.numpy().tolist() == [3] * 3
 
 
 def test_a_launch_with_wrong_arguments_is_refused_before_anything_runs(device):

@@ -27,7 +27,7 @@ def drawn(device, coordinates, count: int = 2) -> np.ndarray:
 
 
 def test_no_two_coordinates_draw_the_same(device):
-    """Also far out: an offset packed into 32 bits repeats after some thousand episodes."""
+    # Also far out: an offset packed into 32 bits repeats after some thousand episodes.
     seeds, episodes, indices = (0, 1, 2**31 - 1, -1), (0, 1, 4096, 8192, 16384, 10**6), (0, 1, 65535, 65536, 131072)
     values = drawn(device, list(itertools.product(seeds, episodes, range(3), indices)))
     assert len(np.unique(values, axis=0)) == len(values) == 360
@@ -41,7 +41,7 @@ def test_a_draw_does_not_depend_on_the_others(device):
 
 @pytest.mark.parametrize("varied", range(4))
 def test_neighbouring_coordinates_are_uncorrelated_and_uniform(device, varied):
-    """Kolmogorov-Smirnov and lag-one correlation of 20,000 draws, at three and a half standard errors or so."""
+    # Kolmogorov-Smirnov and lag-one correlation of 20,000 draws, at three and a half standard errors or so.
     n = 20_000
     coordinates = np.tile(np.array([3, 1, 1, 2], np.int32), (n, 1))
     coordinates[:, varied] = np.arange(n)

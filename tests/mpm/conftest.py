@@ -12,28 +12,16 @@ import pytest
 from benchmarks.physics.matter import Matter, ball, build_matter, lattice
 from piavatar_envs.mpm.model import BODY_CONTACT_GATE, Fields, MaterialPoints
 
-FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
-
 
 @pytest.fixture(scope="session")
 def simulate(device: str) -> Callable[..., Matter]:
-    """Builds a box of matter, see :func:`benchmarks.physics.matter.build_matter`."""
+    """Build a box of matter, see :func:`benchmarks.physics.matter.build_matter`."""
     return partial(build_matter, device=device)
-
-
-@pytest.fixture
-def three_boxes() -> list[dict]:
-    """Bodies for ``meet``: two that come together, and one that comes down on both."""
-    return [
-        {"box": ((-0.23, -0.1, -0.1), (-0.03, 0.1, 0.1)), "velocity": (2.0, 0.2, -0.3)},
-        {"box": ((0.0, -0.08, -0.1), (0.2, 0.12, 0.1)), "velocity": (-1.5, 0.0, -0.3), "density": 600.0},
-        {"box": ((-0.1, -0.1, 0.13), (0.1, 0.1, 0.23)), "velocity": (0.0, 0.0, -3.0)},
-    ]
 
 
 @pytest.fixture(scope="session")
 def meet(simulate) -> Callable[..., Matter]:
-    """Builds boxes and balls with velocities, each a subject and a row of the contact sensor of its own.
+    """Build boxes and balls with velocities, each a subject and a row of the contact sensor of its own.
 
     A body is ``{"box": (lower, upper)}`` or ``{"ball": (center, radius)}`` and may have a ``velocity`` [m/s] and a
     ``density`` [kg/m^3]; its Young's modulus is ``stiffness * density``, so that all have the same speed of sound.

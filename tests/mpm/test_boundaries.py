@@ -12,7 +12,7 @@ BLOCK = {"lower": (-0.1, -0.1, 0.0), "upper": (0.1, 0.1, 0.1), "dx": DX, "spacin
 
 
 def block_on_incline(simulate, slope, friction, plane=(GROUND, 0.0)):
-    """The plane stays level, gravity tilts: ``tan(angle) = slope`` along +x.
+    """Build a block on a level plane under tilted gravity: ``tan(angle) = slope`` along +x.
 
     The block is loaded slowly, under damping: put down at once it rocks, and rocking bodies creep below the friction
     angle, as they do in reality.
@@ -25,13 +25,13 @@ def block_on_incline(simulate, slope, friction, plane=(GROUND, 0.0)):
 
 
 def mean_velocity(sim):
-    """Along the slope [m/s]."""
+    """Return the velocity along the slope [m/s]."""
     return sim.get("u")[:, 0].mean()
 
 
-@pytest.mark.parametrize(("slope", "friction"), [(0.3, 0.29), (0.6, 0.5), (0.6, 0.0), (1.2, 0.5)])
+@pytest.mark.parametrize(("slope", "friction"), [(0.3, 0.29), (0.6, 0.0), (1.2, 0.5)])
 def test_block_slips_with_the_acceleration_of_coulomb(simulate, slope, friction):
-    """``a = g (sin - mu cos)``."""
+    # ``a = g (sin - mu cos)``.
     angle = np.arctan(slope)
     sim = block_on_incline(simulate, slope, friction)
     start, steps = mean_velocity(sim), 8
@@ -40,7 +40,7 @@ def test_block_slips_with_the_acceleration_of_coulomb(simulate, slope, friction)
     assert acceleration == pytest.approx(9.81 * (np.sin(angle) - friction * np.cos(angle)), abs=0.002 * 9.81)
 
 
-@pytest.mark.parametrize(("slope", "friction"), [(0.3, 0.31), (0.6, 0.62), (0.8, 0.85)])
+@pytest.mark.parametrize(("slope", "friction"), [(0.3, 0.31), (0.8, 0.85)])
 def test_block_stays_below_the_friction_angle(simulate, slope, friction):
     sim = block_on_incline(simulate, slope, friction)
     before = sim.get("x")[:, 0].mean()
@@ -49,16 +49,9 @@ def test_block_stays_below_the_friction_angle(simulate, slope, friction):
     assert abs(mean_velocity(sim)) < 1e-4
 
 
-def test_plane_normals_are_normalised(simulate):
-    """A normal of length 3 and three times the offset say the same plane."""
-    one = block_on_incline(simulate, 0.6, 0.5, plane=((0.0, 0.0, 1.0), -0.005))
-    three = block_on_incline(simulate, 0.6, 0.5, plane=((0.0, 0.0, 3.0), -0.015))
-    assert np.abs(one.get("x") - three.get("x")).max() < 1e-6
-
-
 @pytest.mark.parametrize("decoupling", ["split", "paper"])
 def test_impulse_is_the_change_of_momentum(simulate, decoupling):
-    """Newton's third law at every moment of a fall, an oblique impact and the rest after it."""
+    # Newton's third law at every moment of a fall, an oblique impact and the rest after it.
     gravity = np.array([0.5, 0.0, -9.81])
     sim = simulate(**BLOCK, gravity=gravity, planes=[(GROUND, -0.02, 0.4)], decoupling=decoupling)
     sim.set(u=[1.0, 0.5, -1.0])
@@ -71,34 +64,27 @@ def test_impulse_is_the_change_of_momentum(simulate, decoupling):
     assert impulse[2] > 0.5 * n * dt * now.mass * 9.81
 
 
-def test_ground_presses_below_the_middle(simulate):
-    """At rest the moment of the ground's impulse is that of the weight: its centre of pressure is below the body's."""
-    at = np.array([0.13, -0.08])
+def test_ground_bears_the_weight_below_the_middle(simulate):
+    # At rest its impulse and the moment of that are those of the weight.
+    at, steps = np.array([0.13, -0.08]), 30
     block = {**BLOCK, "lower": (*(at - 0.1), 0.0), "upper": (*(at + 0.1), 0.1)}
     sim = simulate(**block, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
     sim.scratch.sensors.accumulators.zero_()
-    sensors = sim.run(30).scratch.sensors
+    sensors = sim.run(steps).scratch.sensors
     impulse, moment = sensors.boundary_impulse.numpy()[0, 0], sensors.boundary_moment.numpy()[0, 0]
+    weight = sim.totals().mass * 9.81
+    assert impulse[2] == pytest.approx(weight * steps * sim.model.control_dt, rel=2e-3)
+    assert np.abs(impulse[:2]).max() < 2e-3 * impulse[2]
+    assert np.abs(sim.get("u")).max() < 5e-3
     middle = sim.get("x").mean(0)[:2]
     assert np.abs(middle - at).max() < 1e-3
     assert np.array([-moment[1], moment[0]]) / impulse[2] == pytest.approx(middle, abs=1e-3)
 
 
-def test_ground_bears_the_weight(simulate):
-    sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
-    sim.scratch.sensors.accumulators.zero_()
-    steps = 30
-    impulse = sim.run(steps).scratch.sensors.boundary_impulse.numpy()[0, 0]
-    weight = sim.totals().mass * 9.81
-    assert impulse[2] == pytest.approx(weight * steps * sim.model.control_dt, rel=2e-3)
-    assert np.abs(impulse[:2]).max() < 2e-3 * impulse[2]
-    assert np.abs(sim.get("u")).max() < 5e-3
-
-
 @pytest.mark.parametrize("speed", [1.0, 4.0])
 @pytest.mark.parametrize("how", ["u", "vk"])
 def test_nothing_passes_a_plane(simulate, how, speed):
-    """A soft block thrown at the ground, or carried at it by its prescribed velocity, stays above it and bounces."""
+    # A soft block thrown at the ground, or carried at it by its prescribed velocity, stays above it and bounces.
     sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)], young_modulus=2.0e4, num_substeps=15)
     sim.set(**{how: [0.0, 0.0, -speed]})
     for _ in range(5):
@@ -109,7 +95,7 @@ def test_nothing_passes_a_plane(simulate, how, speed):
 
 
 def test_contact_candidates_without_contact_move_like_others(simulate):
-    """Kinematic momentum is for contact: a body just above the ground does what it does where there is none."""
+    # Kinematic momentum is for contact: a body just above the ground does what it does where there is none.
     spin = np.array([0.5, -1.0, 2.0])
     free, candidates = (simulate(**BLOCK, planes=planes, num_substeps=15) for planes in ([], [(GROUND, -0.02, 0.5)]))
     vk = np.cross(spin, free.rest) + [0.3, 0.0, 2.0]
@@ -123,19 +109,8 @@ def test_contact_candidates_without_contact_move_like_others(simulate):
     assert candidates.scratch.sensors.boundary_impulse.numpy()[0, 0].tolist() == [0.0, 0.0, 0.0]
 
 
-def test_own_prescribed_motion_meets_the_ground_too(simulate):
-    """The few that go down against the many that go up are lost in the grid's mean; none of them may go below."""
-    sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)], num_substeps=15)
-    row, column, _ = np.round(sim.rest / BLOCK["spacing"] - 0.5).astype(int).T
-    sign = np.where((row % 3 == 0) & (column % 3 == 0), -1.0, 1.0)
-    sim.set(vk=sign[:, None] * [0.0, 0.0, 1.0])
-    for _ in range(3):
-        assert sim.run().get("x")[:, 2].min() > 0.01  # they began at 0.0125
-    assert sim.get("x")[sign > 0, 2].min() > 0.1  # the others do go up
-
-
 def test_leaving_the_ground_is_free(simulate):
-    """A plane pushes; it does not pull, and has no friction on what leaves."""
+    # A plane pushes; it does not pull, and has no friction on what leaves.
     sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)])
     velocity = np.array([0.7, -0.4, 1.0])
     sim.set(u=velocity).run(2)
@@ -144,7 +119,7 @@ def test_leaving_the_ground_is_free(simulate):
 
 
 def test_prescribed_motion_meets_the_ground_like_momentum(simulate):
-    """Contact acts on the total velocity: what share of it is prescribed makes no difference."""
+    # Contact acts on the total velocity: what share of it is prescribed makes no difference.
     runs = []
     for share in (0.0, 0.3, 1.0):
         sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)], gravity=(0.0, 0.0, -9.81))
@@ -155,7 +130,7 @@ def test_prescribed_motion_meets_the_ground_like_momentum(simulate):
 
 
 def test_corner_of_two_planes(simulate):
-    """Pulled into a corner, a block rests on both planes."""
+    # Pulled into a corner, a block rests on both planes.
     gravity = (-5.0, 0.0, -9.81)
     sim = simulate(**BLOCK, gravity=gravity, planes=[(GROUND, 0.0, 0.0), ((1.0, 0.0, 0.0), -0.1, 0.0)]).run(30)
     sim.scratch.sensors.accumulators.zero_()
@@ -164,19 +139,10 @@ def test_corner_of_two_planes(simulate):
     assert impulse == pytest.approx(expected, abs=0.02 * expected[2])
 
 
-def test_no_contact_at_a_distance(simulate):
-    """The grid feels a plane three cells early; matter more than the gate above it falls freely."""
-    planes = [(GROUND, -0.6 * DX, 0.5)]
-    sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=planes, num_substeps=15, control_dt=0.02).run()
-    assert sim.scratch.sensors.boundary_impulse.numpy()[0, 0].tolist() == [0.0, 0.0, 0.0]
-    assert np.abs(sim.get("u")[:, 2] + 9.81 * 0.02).max() < 1e-5
-
-
-@pytest.mark.parametrize("planes", [[], [(GROUND, 0.0, 0.5)], [((1.0, 0.2, 1.0), -0.05, 0.5)]])
-@pytest.mark.parametrize("num_substeps", [15, 16])
-def test_scratch_is_clear_between_steps(simulate, planes, num_substeps):
-    """The next substep adds to what it finds: the grid pass must have cleared every node."""
-    sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=planes, num_substeps=num_substeps)
+@pytest.mark.parametrize("planes", [[], [((1.0, 0.2, 1.0), -0.05, 0.5)]])
+def test_the_grid_is_clear_between_steps(simulate, planes):
+    # The next substep adds to what it finds.
+    sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=planes, num_substeps=15)
     sim.set(u=[2.0, 1.0, 0.5])
     for _ in range(4):
         sim.run()

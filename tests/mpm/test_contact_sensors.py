@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
-
-from piavatar_envs.mpm.sparse_grid import fields_next
-from piavatar_envs.mpm.types import FAILURE_OUT_OF_GRID, Blocks, Grid
 
 DX = 0.05
 ARRAYS = ("x", "u", "C", "F")
@@ -18,7 +14,7 @@ CUBE = {"box": ((-0.2, -0.1, -0.1), (0.0, 0.1, 0.1))}
 
 @pytest.mark.parametrize("normals", ["shared", "own"])
 def test_impulses_are_the_changes_of_momentum(meet, normals):
-    """On the pair, on the parts by subject, and on each body: Newton's third law at every moment."""
+    # On the pair, on the parts by subject, and on each body: Newton's third law at every moment.
     sim = meet([BLOCK, BALL], normals=normals, friction=0.3, control_dt=1.0 / 240.0)
     sensors, scale = sim.scratch.sensors, sim.totals().momentum_scale
     before, most = [sim.totals(select=sim.of(body)).momentum for body in range(2)], 0.0
@@ -38,15 +34,11 @@ def test_impulses_are_the_changes_of_momentum(meet, normals):
     assert most > 0.05 * scale
 
 
-@pytest.mark.parametrize("overlap", [-0.5, 0.1, 0.4, 0.8])
-@pytest.mark.parametrize("density", [500.0, 2000.0])
-@pytest.mark.parametrize("path", [None, "tiled"])
-def test_penetration_of_a_known_overlap(meet, device, overlap, density, path):
-    """The centre of the deepest particle, a quarter of a spacing inside its body; the bodies are at rest."""
-    if device == "cpu" and path:
-        pytest.skip("a CPU has only the plain path")
+@pytest.mark.parametrize(("overlap", "density"), [(-0.5, 500.0), (0.1, 2000.0), (0.4, 2000.0), (0.8, 500.0)])
+def test_penetration_of_a_known_overlap(meet, overlap, density):
+    # The centre of the deepest particle, a quarter of a spacing inside its body; the bodies are at rest.
     into = {"box": ((-overlap * DX, -0.1, -0.1), (0.2 - overlap * DX, 0.1, 0.1)), "density": density}
-    sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4, path=path).run()
+    sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4).run()
     expected = max(0.0, overlap - 0.25) * DX
     found = sim.scratch.sensors.penetration.numpy()[0]
     np.testing.assert_allclose(found, expected, atol=0.15 * DX)
@@ -54,22 +46,21 @@ def test_penetration_of_a_known_overlap(meet, device, overlap, density, path):
     assert overlap < 0.2 or found.all()
 
 
-@pytest.mark.parametrize("path", ["tiled"])
-def test_penetration_of_bodies_that_go_on(meet, device, path):
-    """They enter blocks that the last G2P has activated, which hold no velocities yet."""
+def test_penetration_of_bodies_that_go_on(meet, device):
+    # On tiles: they enter blocks that the last G2P has activated, which hold no velocities yet.
     if device == "cpu":
         pytest.skip("a CPU has only the plain path")
-    for substeps in (1, 2, 5, 9):
+    for substeps in (2, 9):
         settings = {"num_substeps": substeps, "control_dt": 1e-3 * substeps}
-        sims = [meet([BLOCK, BALL], path=way, **settings) for way in ("plain", path)]
-        for _ in range(36 // substeps):
+        sims = [meet([BLOCK, BALL], path=way, **settings) for way in ("plain", "tiled")]
+        for _ in range(18 // substeps):
             plain, found = (sim.run().scratch.sensors.penetration.numpy() for sim in sims)
             np.testing.assert_allclose(found, plain, atol=1e-4)
         assert plain.max() > 0.002
 
 
 def test_sensors_forget(meet):
-    """They cover one control step."""
+    # They cover one control step.
     sim = meet([BLOCK, BALL], control_dt=1.0 / 60.0).run(2)
     sensors = sim.scratch.sensors
     assert sensors.pair_impulse.numpy().any() and sensors.part_impulse.numpy().any()
@@ -83,34 +74,8 @@ def sensed(sim, env=0):
     return {name: getattr(sim.scratch.sensors, name).numpy()[env] for name in names}
 
 
-def test_three_environments_equal_three_single_ones(meet, equal):
-    """Each with another ball speed."""
-    scene = {"friction": 0.4, "num_substeps": 16}
-    batch, speeds = meet([BLOCK, BALL], num_envs=3, **scene), (1.0, 0.5, 2.0)
-    velocities = np.stack([speed * batch.get("u") for speed in speeds])
-    batch.set(u=velocities).run(3)
-    for env in range(3):
-        single = meet([BLOCK, BALL], **scene).set(u=velocities[env]).run(3)
-        for array in ARRAYS:
-            assert equal(batch.get(array, env), single.get(array)), array
-        found, expected = sensed(batch, env), sensed(single)
-        assert all(equal(found[name], expected[name]) for name in expected)
-    assert np.abs(batch.get("x", 0) - batch.get("x", 1)).max() > 0.1 * DX
-
-
-def test_a_failed_environment_is_frozen_and_senses_nothing(meet):
-    """Its neighbour goes on."""
-    sim = meet([BLOCK, BALL], num_envs=2)
-    sim.state.failure.assign(np.array([FAILURE_OUT_OF_GRID, 0], np.int32))
-    before = sim.state.numpy()
-    sim.run()
-    assert all(np.array_equal(sim.get(name), before[name][0].astype(float)) for name in ARRAYS)
-    assert not any(array.any() for array in sensed(sim).values())
-    assert all(array.any() for name, array in sensed(sim, 1).items() if name != "penetration")
-
-
 def test_a_failure_in_contact_leaves_the_grid_clear(meet):
-    """A particle that is lost in the middle of a collision takes nothing with it."""
+    # A particle that is lost in the middle of a collision takes nothing with it.
     sim = meet([BLOCK, BALL], num_envs=2).run()
     u = sim.state.u.numpy()
     u[0, 3] = np.inf
@@ -120,11 +85,9 @@ def test_a_failure_in_contact_leaves_the_grid_clear(meet):
     assert sim.accumulators_are_clear
 
 
-@pytest.mark.parametrize("normals", ["shared", "own"])
-@pytest.mark.parametrize("num_substeps", [15, 16])
-def test_scratch_is_clear_between_steps(meet, normals, num_substeps):
+def test_the_grid_is_clear_between_steps(meet):
     plane = [((0.0, 0.0, 1.0), -0.11, 0.5)]
-    sim = meet([BLOCK, BALL], normals=normals, num_substeps=num_substeps, planes=plane, gravity=(0.0, 0.0, -9.81))
+    sim = meet([BLOCK, BALL], num_substeps=15, planes=plane, gravity=(0.0, 0.0, -9.81))
     for _ in range(3):
         sim.run()
         assert sim.failures == [0]
@@ -132,10 +95,8 @@ def test_scratch_is_clear_between_steps(meet, normals, num_substeps):
 
 
 def test_contacts_leave_nothing_behind(meet, equal):
-    """A world whose bodies have met all over the grid goes on like a new one.
-
-    The cubes' last common nodes end a block of the grid: what the next block once held is not to be looked at.
-    """
+    # A world whose bodies have met all over the grid goes on like a new one. The cubes' last common nodes end a block
+    # of the grid: what the next block once held is not to be looked at.
     cubes = [
         {"box": ((-0.2, -0.2, -0.2), (0.0, 0.0, 0.0)), "velocity": (1.0, 0.2, 0.0)},
         {"box": ((0.0, -0.2, -0.2), (0.2, 0.0, 0.0)), "velocity": (-1.0, 0.0, 0.0)},
@@ -151,27 +112,3 @@ def test_contacts_leave_nothing_behind(meet, equal):
         assert equal(used.get(array), fresh.get(array)), array
     found, expected = sensed(used), sensed(fresh)
     assert all(equal(found[name], expected[name]) for name in expected)
-
-
-@wp.kernel
-def ask_next(grid: Grid, blocks: Blocks, found: wp.array2d(dtype=int)):
-    block, n = wp.tid()
-    found[block, n] = fields_next(grid, blocks, block, 0, n)
-
-
-def test_blocks_that_a_stencil_may_lie_in(meet, device):
-    """They are the block and those next to it; where the grid ends, any that there is."""
-    sim = meet([BLOCK])
-    grid, blocks = sim.model.grid, sim.scratch.blocks
-    shape = tuple(grid.blocks)
-    assert len(set(shape)) > 1
-    blocks.fields.assign(np.broadcast_to(np.arange(grid.num_blocks, dtype=np.int32), blocks.fields.shape).copy())
-    found = wp.full((grid.num_blocks, 8), -1, dtype=int, device=device)
-    wp.launch(ask_next, found.shape, [grid, blocks], [found], device=device, block_dim=64)
-    offsets = np.array(list(np.ndindex(2, 2, 2)))
-    places = np.array(list(np.ndindex(shape)))[:, None] + offsets
-    exists = (places < shape).all(-1)
-    assert exists.any() and not exists.all()
-    expected = np.ravel_multi_index(np.moveaxis(np.minimum(places, np.array(shape) - 1), -1, 0), shape)
-    np.testing.assert_array_equal(found.numpy()[exists], expected[exists])
-    assert (found.numpy() >= 0).all() and (found.numpy() < grid.num_blocks).all()

@@ -9,7 +9,6 @@ from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
-    failure_name,
 )
 
 VICTIM, PARTICLE = 1, 37
@@ -33,7 +32,7 @@ FAULTS = {
 
 @pytest.fixture(scope="module", params=[None, "tiled"])
 def three(simulate, device, request):
-    """Three environments in free fall onto the ground, each with another velocity; a fresh start each call.
+    """Return a function that starts three environments in free fall, each with another velocity.
 
     On a GPU also on the tiled path.
     """
@@ -65,13 +64,13 @@ def test_fault_is_flagged_and_contained(three, fault):
     sim = three()
     break_particle(sim, name, value)
     got = sim.run(3).state.numpy()
-    assert sim.failures == [0, failure, 0]
+    assert sim.failures == [0, failure, 0] and sim.accumulators_are_clear
     for array in ARRAYS:
         for env in (0, 2):
             assert np.array_equal(got[array][env], expected[array][env]), array
 
 
-@pytest.mark.parametrize("fault", ["position is not a number", "left above", "absurd speed"])
+@pytest.mark.parametrize("fault", ["left above", "absurd speed"])
 def test_failed_environment_is_frozen(three, fault):
     name, value, failure = FAULTS[fault]
     sim = three()
@@ -83,44 +82,25 @@ def test_failed_environment_is_frozen(three, fault):
     assert np.array_equal(after["F"][VICTIM], frozen["F"][VICTIM], equal_nan=True)
     moved = np.abs(after["x"] - frozen["x"]).max(axis=(1, 2))
     assert moved[0] > 0.01 and moved[2] > 0.01
+    expected, again = (three().run(2).state.numpy() for _ in range(2))  # the first begins where the failure was
+    np.testing.assert_array_equal(again["x"], expected["x"])
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_nothing_of_a_fault_stays_on_the_grid(three, fault):
-    name, value, _ = FAULTS[fault]
-    sim = three()
-    break_particle(sim, name, value)
-    sim.run()
-    assert sim.accumulators_are_clear
-
-
-def test_environment_runs_again_after_a_reset(three):
-    """Once its state is whole and its flag is down, it does what it would have done."""
-    expected = three().run(2).state.numpy()
-    sim = three()
-    break_particle(sim, "x", np.nan)
-    sim.run(2)
-    again = three().run(2).state.numpy()
-    assert np.abs(again["x"] - expected["x"]).max() < 1e-6
-
-
-def test_healthy_flags_of_other_causes_are_kept(three):
-    """A flag of another cause freezes the environment, and stays."""
-    sim = three()
-    sim.state.failure.assign(np.array([8, 0, 0], np.int32))
-    sim.run()
-    assert sim.failures == [8, 0, 0]
-    assert np.array_equal(sim.get("x", env=0), sim.rest.astype(np.float32))
-
-
-def test_failure_names():
-    assert failure_name(0) is None
-    assert failure_name(FAILURE_CFL) == "cfl"
-    assert failure_name(FAILURE_NONFINITE | FAILURE_OUT_OF_GRID) == "nonfinite+out_of_grid"
+@pytest.mark.parametrize("axis", range(3))
+def test_a_stencil_must_lie_inside_the_grid(simulate, axis):
+    # The outermost cell and a half hold none; nor do places whose cell is no 32-bit integer.
+    sim = simulate(num_envs=10, num_substeps=1, control_dt=1e-4)
+    grid, dx = sim.model.grid, float(sim.model.grid.dx)
+    low = float(grid.origin[axis]) + 0.5 * dx
+    high = float(grid.origin[axis]) + (int(grid.nodes[axis]) - 1.5) * dx
+    x = np.broadcast_to(sim.rest, (10, *sim.rest.shape)).copy()
+    outward = (-1e-3, 1e-3, 10.0, 1e10, 1e15)
+    x[:, PARTICLE, axis] = [edge + sign * way for edge, sign in ((low, -1.0), (high, 1.0)) for way in outward]
+    assert sim.set(x=x).run().failures == 2 * [0, *4 * [FAILURE_OUT_OF_GRID]]
 
 
 def test_what_a_failure_leaves_does_not_depend_on_the_order_of_the_particles(simulate):
-    """All others make the substep in which one fails, whether they come before it or after it in memory."""
+    # All others make the substep in which one fails, whether they come before it or after it in memory.
     rest = simulate().rest
     broken = np.argmin(np.linalg.norm(rest - rest.min(axis=0), axis=1))
     moved = []

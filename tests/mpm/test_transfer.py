@@ -9,7 +9,7 @@ from piavatar_envs.mpm.materials import MATERIALS
 
 
 def smooth_velocity(x, seed=0, amplitude=1.0, wavelength=0.3):
-    """A random smooth velocity field without drift [m/s], shape of ``x``."""
+    """Return a random smooth velocity field without drift [m/s], shape of ``x``."""
     rng = np.random.default_rng(seed)
     waves = rng.normal(size=(4, 3)) * 2.0 * np.pi / wavelength / np.sqrt(3.0)
     velocity = amplitude * np.sin(x @ waves.T + rng.uniform(0.0, 6.0, 4)) @ rng.normal(size=(4, 3))
@@ -17,13 +17,13 @@ def smooth_velocity(x, seed=0, amplitude=1.0, wavelength=0.3):
 
 
 def strain(F):
-    """Largest entry of ``F^T F - I``."""
+    """Return the largest entry of ``F^T F - I``."""
     return np.abs(np.swapaxes(F, 1, 2) @ F - np.eye(3)).max()
 
 
 @pytest.mark.parametrize("decoupling", ["split", "paper", "none", "no_stress"])
 def test_momentum_of_a_free_body_is_kept(simulate, decoupling):
-    """Linear and angular momentum, to round-off, while it deforms by tens of percent and is driven by ``vk``."""
+    # Linear and angular momentum, to round-off, while it deforms by tens of percent and is driven by ``vk``.
     rng = np.random.default_rng(2)
     sim = simulate(num_substeps=40, decoupling=decoupling, control_dt=0.06, young_modulus=1.0e4)
     u, C = smooth_velocity(sim.rest, 1) + [0.5, -0.3, 0.2], rng.normal(size=(len(sim.rest), 3, 3))
@@ -41,7 +41,7 @@ def test_momentum_of_a_free_body_is_kept(simulate, decoupling):
 
 @pytest.mark.parametrize("material", MATERIALS)
 def test_energy_never_rises(simulate, material):
-    """A free body that vibrates and tumbles: APIC may lose energy, never gain any."""
+    # A free body that vibrates and tumbles: APIC may lose energy, never gain any.
     sim = simulate(num_substeps=20, material=material)
     sim.set(u=smooth_velocity(sim.rest, 1, 1.0, wavelength=0.8))
     history = [sim.totals(), *(sim.run().totals() for _ in range(40))]
@@ -52,7 +52,7 @@ def test_energy_never_rises(simulate, material):
 
 
 def test_free_fall(simulate):
-    """Symplectic Euler of the particle alone: v = g t and x = g dt^2 n (n + 1) / 2, with no strain."""
+    # Symplectic Euler of the particle alone: v = g t and x = g dt^2 n (n + 1) / 2, with no strain.
     gravity, steps = np.array([0.3, -0.5, -9.81]), 40
     sim = simulate(num_substeps=steps, control_dt=0.2, gravity=gravity, young_modulus=5.0e4)
     dt = 0.2 / steps
@@ -64,7 +64,7 @@ def test_free_fall(simulate):
 
 
 def test_affine_field_is_reproduced(simulate):
-    """APIC carries an affine velocity through the grid and back, whatever the particles' masses."""
+    # APIC carries an affine velocity through the grid and back, whatever the particles' masses.
     rng = np.random.default_rng(4)
     offset, B = rng.normal(size=3), rng.normal(size=(3, 3))
     sim = simulate(num_substeps=1, control_dt=1e-4, decoupling="no_stress")
@@ -78,7 +78,7 @@ def test_affine_field_is_reproduced(simulate):
 
 
 def test_spinning_body(simulate):
-    """A rigid spin makes no stress but that of its centrifugal force, and keeps its angular momentum and speed."""
+    # A rigid spin makes no stress but that of its centrifugal force, and keeps its angular momentum and speed.
     omega, young_modulus = np.array([1.0, -2.0, 3.0]), 1.0e6
     sim = simulate(young_modulus=young_modulus, control_dt=0.5, num_substeps=700)
     x = sim.rest
@@ -96,7 +96,7 @@ def test_spinning_body(simulate):
 
 
 def test_gravity_is_the_only_force_without_stress(simulate):
-    """``"no_stress"``: a body squeezed to half its size stays so, with stress it bursts."""
+    # ``"no_stress"``: a body squeezed to half its size stays so, with stress it bursts.
     squeezed = 0.5 * np.eye(3)
     still = simulate(decoupling="no_stress").set(F=squeezed).run()
     assert np.abs(still.get("u")).max() == 0.0

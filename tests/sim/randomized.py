@@ -14,14 +14,14 @@ VARIED = {f"randomize.{name}": bounds for name, bounds in RANGES.items()}
 
 
 def factors_of(batch) -> dict[str, np.ndarray]:
-    """Drawn factors by setting, of the world ``(num_envs,)`` and of avatars ``(num_envs, avatars)``."""
+    """Return the drawn factors by setting, of the world ``(num_envs,)`` and of avatars ``(num_envs, avatars)``."""
     random, avatars = batch.simulation.randomization, range(batch.num_agents)
     found = {name: random.column(name).numpy() for name in OF_WORLD}
     return found | {name: np.stack([random.column(name, a).numpy() for a in avatars], 1) for name in OF_AVATAR}
 
 
 def constants_of(batch, avatar: int = 0) -> dict[str, np.ndarray]:
-    """What follows from the factors, a row an environment."""
+    """Return the constants that follow from the factors, a row an environment."""
     sim, n = batch.simulation, batch.num_envs
     model, drive = sim.model, sim.avatars[avatar]
     own = slice(drive.body.first, drive.body.first + drive.body.count)
@@ -34,23 +34,23 @@ def constants_of(batch, avatar: int = 0) -> dict[str, np.ndarray]:
 
 
 def seen(batch) -> np.ndarray:
-    """The term of every environment and agent."""
+    """Return the observed term of every environment and agent."""
     return batch.observation.numpy()[:, :, batch.layout[PARAMETERS].slice].copy()
 
 
 def by_name(batch, agent: int = 0) -> dict[str, np.ndarray]:
-    """Parameters in their units, by name, from what an agent observes."""
+    """Return parameters in their units, by name, from what an agent observes."""
     parameters = batch.layout[PARAMETERS].parameters
     return {p.name: p.value(column) for p, column in zip(parameters, seen(batch)[:, agent].T, strict=True)}
 
 
 def is_setting(parameter: Parameter) -> bool:
-    """Whether it is not drawn, but set for all episodes."""
+    """Return whether it is not drawn, but set for all episodes."""
     return parameter.name.endswith(ASSIST.name)
 
 
 def check_term(batch, mask: np.ndarray) -> None:
-    """What holds for every task: last in the layout, in range, differs between seeds, as the arrays say, constant."""
+    """Check the term for any task: last in the layout, in range, differs between seeds, as the arrays say, constant."""
     term = batch.layout[PARAMETERS]
     assert list(batch.layout)[-1] == PARAMETERS and term.slice.stop == batch.layout.size
     assert term.size == len(term.parameters) and len({p.name for p in term.parameters}) == term.size
@@ -64,22 +64,22 @@ def check_term(batch, mask: np.ndarray) -> None:
         assert not constant, f"{constant} do not differ between seeds"
     factors = factors_of(batch)
     for agent in range(batch.num_agents):
-        told = by_name(batch, agent)
+        observed = by_name(batch, agent)
         for name in OF_WORLD:
-            assert told[name] == pytest.approx(factors[name], rel=1e-5)
+            assert observed[name] == pytest.approx(factors[name], rel=1e-5)
         for index in range(batch.num_agents):
             other = (agent + index) % batch.num_agents
             prefix = f"other_{index - 1}_" if index else ""
             for name in OF_AVATAR:
-                assert told[prefix + name] == pytest.approx(factors[name][:, other], rel=1e-5)
+                assert observed[prefix + name] == pytest.approx(factors[name][:, other], rel=1e-5)
             flesh = batch.simulation.flesh[other]
             for name, value in zip(flesh.asset.shape_names, flesh.shape_parameters.T, strict=True):
-                assert told[f"{prefix}shape_{name}"] == pytest.approx(value, abs=1e-6)
+                assert observed[f"{prefix}shape_{name}"] == pytest.approx(value, abs=1e-6)
         for p, drawn in zip(batch.task.drawn(), batch.task.drawn_values(batch), strict=True):
             values = drawn.scale * drawn.values.numpy()
             assert (values >= p.low - 1e-5).all() and (values <= p.high * (1 + 1e-5) + 1e-5).all(), p.name
             if p.low < p.high:
-                assert told[p.name] == pytest.approx(values, rel=1e-4, abs=1e-5 * (p.high - p.low)), p.name
+                assert observed[p.name] == pytest.approx(values, rel=1e-4, abs=1e-5 * (p.high - p.low)), p.name
     batch.action.zero_()
     for step in range(3):
         batch.step()

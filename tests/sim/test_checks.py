@@ -1,4 +1,4 @@
-"""What would begin inside of something else is refused with the way out, and contact is not."""
+"""Things that would begin inside of others are refused with the way out; contact is allowed."""
 
 from __future__ import annotations
 
@@ -25,19 +25,16 @@ def build(device, task=REACH, fidelity="tiny", **scene) -> BatchEnv:
 
 INSIDE = {
     "ball in the belly": {"props": [BALL | {"position": [0.0, 0.0, 1.0]}]},
-    "ball in the head": {"props": [BALL | {"position": [0.0, 0.0, 1.6]}]},
     "beside the origin": {
         "props": [BALL | {"position": [0.9, 0.3, 1.0]}],
         "avatars": [{"position": [0.9, 0.3], "yaw": 1.0}],
     },
-    "crate in the body": {"colliders": [CRATE | {"position": [0.0, 0.2, 1.0]}]},
     "ball in the crate": {
         "colliders": [CRATE | {"position": [0.0, -1.0, 1.0]}],
         "props": [BALL | {"position": [0.1, -1.0, 1.0]}],
     },
     "ball in the floor": {"props": [BALL | {"position": [0.0, -1.0, -0.1]}]},
     "feet in a step": {"colliders": [FLOOR | {"position": [0.0, 0.0, 0.3]}]},
-    "slope": {"colliders": [FLOOR | {"position": [0.0, 1.0, 0.0], "rotation": [0.92, -0.38, 0.0, 0.0]}]},
     "box that stands in the legs": {
         "props": [{"name": "box", "shape": "box", "size": [0.3, 0.3, 0.3], "position": [0.0, -0.15, 0.3]}]
     },
@@ -57,10 +54,8 @@ def test_what_is_inside_is_refused_and_the_remedy_helps(device, scene):
 @pytest.mark.parametrize(
     "scene",
     [
-        {"props": [BALL | {"position": [0.0, -1.0, 0.14]}]},
         {"props": [BALL | {"position": [0.0, -0.26, 1.0]}]},
         {"props": [BALL | {"position": [0.0, -1.0, -0.1]}], "ground": False},
-        {"colliders": [CRATE | {"position": [0.0, -0.45, 1.0]}, FLOOR]},
         {"colliders": [CRATE | {"position": [0.0, -1.0, 0.3]}, FLOOR], "props": [BALL | {"position": [0, -1.0, 0.73]}]},
         {"avatars": [{"position": [0.0, 0.2]}], "props": [BALL | {"position": [0.0, -0.12, 1.0]}]},
     ],
@@ -76,48 +71,26 @@ def test_a_ball_may_lie_in_a_hand(device):
     build(device, props=[BALL | {"size": [0.06], "position": hand.tolist()}])
 
 
-def test_who_does_not_stand_is_not_taken_to_stand(device):
-    build(device, "PIAvatar/GetUp-v0", props=[BALL | {"position": [0.0, 0.0, 1.3]}])
-
-
 #: At ``coarse`` a grid spacing is 5.2 cm; each with what differs where it is allowed.
 BEHIND = {"name": "wall", "kind": "box", "size": [0.3, 0.1, 0.3], "position": [0.0, 0.2, 1.0]}
 ROD = {"name": "rod", "shape": "capsule", "size": [0.05, 0.4], "mass": 2.0, "position": [0.0, -1.0, 1.0]}
 POST = {"name": "post", "kind": "box", "size": [0.1, 0.1, 0.1], "position": [0.0, -1.35, 1.0]}
-PEA = {"name": "pea", "mass": 0.1, "size": [0.03], "position": [0.0, -1.2, 1.095]}
+POLE = {"name": "pole", "kind": "capsule", "size": [0.045, 0.6], "rotation": [0.7071, 0.0, 0.7071, 0.0]}
 COARSE = {
     "a turned avatar": ({"colliders": [BEHIND], "avatars": [{"yaw": 1.57}]}, {"avatars": [{"yaw": 0.0}]}),
     "a turned rod": (
         {"props": [ROD | {"rotation": [0.7071, 0.7071, 0.0, 0.0]}], "colliders": [POST]},
         {"props": [ROD]},
     ),
-    "the middle of a pea": (
-        {"props": [PEA | {"position": [0.0, -1.2, 1.09]}], "colliders": [POST | {"position": [0.0, -1.2, 1.0]}]},
-        {"props": [PEA | {"position": [0.0, -1.2, 1.11]}]},
-    ),
     "a ball that is not only in contact": (
         {"props": [BALL | {"position": [0.0, -1.2, 1.18]}], "colliders": [POST | {"position": [0.0, -1.2, 1.0]}]},
         {"props": [BALL | {"position": [0.0, -1.2, 1.21]}]},
     ),
     "the end of a pole": (
-        {
-            "colliders": [
-                {"name": "pole", "kind": "capsule", "size": [0.045, 0.6], "position": [0.5, -0.03, 1.1],
-                 "rotation": [0.7071, 0.0, 0.7071, 0.0]}
-            ]
-        },
-        {
-            "colliders": [
-                {"name": "pole", "kind": "capsule", "size": [0.045, 0.6], "position": [0.8, -0.03, 1.1],
-                 "rotation": [0.7071, 0.0, 0.7071, 0.0]}
-            ]
-        },
+        {"colliders": [POLE | {"position": [0.5, -0.03, 1.1]}]},
+        {"colliders": [POLE | {"position": [0.8, -0.03, 1.1]}]},
     ),
-    "a table through the waist": (
-        {"colliders": [{"name": "table", "kind": "box", "size": [0.5, 0.5, 0.02], "position": [0.0, 0.0, 1.05]}]},
-        {"colliders": [{"name": "table", "kind": "box", "size": [0.5, 0.4, 0.02], "position": [0.0, -0.5, 1.05]}]},
-    ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("scene", "instead"), COARSE.values(), ids=COARSE)
@@ -125,13 +98,6 @@ def test_how_things_lie_is_seen(device, scene, instead):
     with pytest.raises(ConfigError, match=r"would begin .*inside .*; move it by "):
         build(device, fidelity="coarse", **scene)
     build(device, fidelity="coarse", **scene | instead)
-
-
-def test_the_shortest_way_out_is_told(device):
-    table = {"name": "table", "kind": "box", "size": [0.5, 0.3, 0.45], "position": [0.0, -0.55, 0.45]}
-    ball = {"name": "ball", "mass": 0.5, "size": [0.11], "position": [0.0, -0.5, 0.94]}
-    with pytest.raises(ConfigError, match=r"move it by 0\.\d+ m along \[0.0, 0.0, 1.0\]"):
-        build(device, fidelity="coarse", props=[ball], colliders=[table])
 
 
 def test_meshes_are_looked_at(device, tmp_path):
@@ -151,7 +117,7 @@ def test_all_avatars_are_looked_at(device):
 
 
 class Ram(load_task(REACH)):
-    """What it adds begins in the body and in each other, if it began there."""
+    """A task whose own prop and collider would overlap the body and each other, if they began where they are."""
 
     def build_scene(self):
         ball = PropConfig(name="own", size=(0.1,), position=(0.0, 0.0, 1.0))

@@ -26,9 +26,9 @@ FOLLOWS |= {"mu": "stiffness_factor", "lam": "stiffness_factor"}
 FOLLOWS |= {"ground": "ground_friction_factor", "pairs": "body_friction_factor"}
 
 
-@pytest.mark.parametrize("one", [*RANGES, "all"])
+@pytest.mark.parametrize("one", ["mass_factor", "stiffness_factor", "all"])
 def test_every_constant_follows_its_factor_and_nothing_else(make_batch, one):
-    """In a world with a prop and limb fields; only what varies has rows of its own."""
+    # In a world with a prop and limb fields.
     settings = {"self_contact": True, "scene.props": [{"name": "ball", "position": (0.0, -1.0, 0.2)}]}
     varied = VARIED if one == "all" else {f"randomize.{one}": RANGES[one]}
     plain, batch = make_batch(REACH, 3, **settings), make_batch(REACH, 3, **settings, **varied)
@@ -51,41 +51,6 @@ def test_every_constant_follows_its_factor_and_nothing_else(make_batch, one):
             assert np.array_equal(*arrays), f"{name} of the ball"
 
 
-def test_only_what_varies_has_rows_of_its_own(make_batch):
-    rows = {}
-    for name in ("none", *RANGES):
-        batch = make_batch(REACH, 3, **({f"randomize.{name}": RANGES[name]} if name in RANGES else {}))
-        model = batch.simulation.model
-        particles = {key: getattr(model.particles, key).shape[0] for key in ("mass", "volume", "mu", "lam", "material")}
-        rows[name] = {key for key, count in particles.items() if count > 1}
-        rows[name] |= {"ground"} if model.boundaries.friction.shape[0] > 1 else set()
-        rows[name] |= {"bones"} if batch.simulation.avatar.body.bone_mass.shape[0] > 1 else set()
-        drawn = [key for key in batch.get_state() if key.startswith("randomize")]
-        assert drawn == ([] if name == "none" else ["randomize.factors"])
-    assert rows["none"] == rows["body_friction_factor"] == set()
-    assert rows["mass_factor"] == {"mass", "bones"} and rows["stiffness_factor"] == {"mu", "lam"}
-    assert rows["ground_friction_factor"] == {"ground"}
-
-
-def test_random_shapes_have_random_density_too(make_batch):
-    """Mass is factor times density times volume of the shape drawn, in the particles, the bones and all of it."""
-    batch = make_batch(REACH, 3, **{"shape.randomize": True, **VARIED})
-    for seeds in ([4, 5, 6], None):
-        batch.reset(seeds=seeds)
-        now, factor = constants_of(batch), factors_of(batch)["mass_factor"]
-        mass = factor * batch.config.physics.density * now["volume"].astype(float).sum(1, keepdims=True)
-        assert now["mass"].astype(float).sum(1, keepdims=True) == pytest.approx(mass, rel=1e-6)
-        assert now["bone_mass"].sum(1, keepdims=True) == pytest.approx(mass, rel=1e-5)
-        assert now["body_mass"] == pytest.approx(mass, rel=1e-5)
-        assert now["density"] == pytest.approx(factor * batch.config.physics.density, rel=1e-6)
-        # the shapes are those of the same seeds without random mass
-        plain = make_batch(REACH, 3, **{"shape.randomize": True})
-        plain.reset(seeds=seeds)
-        assert np.array_equal(now["volume"], constants_of(plain)["volume"])
-        nominal = batch.simulation.flesh[0].points.mass
-        assert nominal == pytest.approx(now["mass"] / factor, rel=1e-6)
-
-
 # The draws.
 
 
@@ -100,7 +65,7 @@ def drawn_factors(device, seeds, episodes, bounds) -> np.ndarray:
 
 
 def test_factors_are_uniform_in_their_logarithm(device):
-    """Kolmogorov-Smirnov at 20,000 draws, over seeds and over episodes; bounds are kept, a point stays one."""
+    # Kolmogorov-Smirnov at 20,000 draws, over seeds and over episodes; bounds are kept, a point stays one.
     n, count = 20_000, np.arange(20_000)
     bounds = [(0.25, 4.0), (0.9, 1.0), (2.0, 2.0)]
     for seeds, episodes in ((count, 0 * count), (7 + 0 * count, count)):
@@ -113,18 +78,11 @@ def test_factors_are_uniform_in_their_logarithm(device):
         assert abs(np.corrcoef(np.log(drawn[:, 0]), np.log(drawn[:, 1]))[0, 1]) < 3.5 / np.sqrt(n)
 
 
-def test_a_factor_does_not_depend_on_the_other_ranges(device):
-    seeds, episodes = np.arange(5), np.full(5, 3)
-    one = drawn_factors(device, seeds, episodes, [(1.0, 1.0), (0.5, 2.0)])
-    both = drawn_factors(device, seeds, episodes, [(0.5, 3.0), (0.5, 2.0)])
-    assert np.array_equal(one[:, 1], both[:, 1])
-
-
 # The time step.
 
 
 def test_the_time_step_is_that_of_the_worst_body(make_batch):
-    """Substeps go with the wave speed ``sqrt(stiffness / density)`` of the ranges, whatever has been drawn."""
+    # Substeps go with the wave speed ``sqrt(stiffness / density)`` of the ranges, whatever has been drawn.
     plain = make_batch(REACH, 1).simulation.model
     for stiffness, mass in (((1.0, 4.0), (1.0, 1.0)), ((1.0, 1.0), (0.25, 1.0)), ((0.5, 2.0), (0.5, 3.0))):
         settings = {"randomize.stiffness_factor": stiffness, "randomize.mass_factor": mass}
@@ -147,17 +105,9 @@ def test_a_time_step_that_a_draw_could_break_is_refused(make_batch, device):
         BatchEnv(task(stiff), 1, device)
 
 
-@pytest.mark.parametrize(
-    ("bounds", "told"),
-    [
-        ((0.0, 1.0), r"randomize.mass_factor.0=0.0 must be >= 0.001"),
-        ((2.0, 1.0), r"randomize.mass_factor=.*lower bound first"),
-        ((-1.0, 1.0), r"randomize.mass_factor.0=-1.0 must be >= 0.001"),
-        (2.0, "randomize.mass_factor=2.0 must be a list"),
-    ],
-)
-def test_ranges_that_are_none_are_refused(bounds, told):
-    with pytest.raises(ConfigError, match=told):
+@pytest.mark.parametrize(("bounds", "value"), [((0.0, 1.0), "0=0.0"), ((2.0, 1.0), "="), (2.0, "=2.0")])
+def test_ranges_that_are_none_are_refused(bounds, value):
+    with pytest.raises(ConfigError, match=rf"randomize\.mass_factor\.?{value}"):
         load_config(load_task(REACH).Config, None, {"mass_factor": bounds})
 
 
@@ -165,7 +115,7 @@ def test_ranges_that_are_none_are_refused(bounds, told):
 
 
 def compressed(batch) -> np.ndarray:
-    """Physical velocity of every particle after one short step from the same compressed, resting body."""
+    """Return the physical velocity of every particle after one short step from the same compressed, resting body."""
     state = batch.get_state()
     state["particles.F"][:] = np.diag([0.95, 1.0, 1.02]).reshape(9, 1)
     batch.set_state(state)
@@ -174,7 +124,7 @@ def compressed(batch) -> np.ndarray:
 
 
 def test_flesh_answers_by_stiffness_over_mass(make_batch):
-    """One substep from the same strain: du = dt f / m with f of the moduli; nothing else acts on the body."""
+    # One substep from the same strain: du = dt f / m with f of the moduli; nothing else acts on the body.
     settings = {**FREE, "control_dt": 1e-3, "num_substeps": 1, "tone": 0.0, "alpha": 0.0, "scene.ground": False}
     plain, batch = make_batch(REACH, 3, **settings), make_batch(REACH, 3, **settings, **VARIED)
     for b in (plain, batch):
@@ -188,31 +138,15 @@ def test_flesh_answers_by_stiffness_over_mass(make_batch):
         assert varied[e] / scale == pytest.approx(ratio[e] * nominal[e] / scale, abs=2e-4)
 
 
-def test_stress_goes_with_the_modulus(make_batch):
-    """The same strain is observed as a stress that many times higher, in units of the nominal modulus."""
-    plain, batch = make_batch(REACH, 3), make_batch(REACH, 3, **VARIED)
-    seen = []
-    for b in (plain, batch):
-        b.reset(seeds=[1, 2, 3])
-        state = b.get_state()
-        state["particles.F"][:] = np.diag([0.95, 1.0, 1.02]).reshape(9, 1)
-        b.set_state(state)
-        seen.append(b.observation.numpy()[:, 0, b.layout["stress"].slice].copy())
-    assert (seen[0] > 0.01).all()
-    assert seen[1] / seen[0] == pytest.approx(
-        np.repeat(factors_of(batch)["stiffness_factor"], seen[0].shape[1], 1), rel=1e-4
-    )
-
-
 def momenta(batch) -> np.ndarray:
-    """Momentum and angular momentum about the origin of every environment, shape ``(num_envs, 6)``."""
+    """Return the momentum and angular momentum about the origin of every environment, shape ``(num_envs, 6)``."""
     s, mass = batch.get_state(), constants_of(batch)["mass"].astype(float)[..., None]
     x, v = s["particles.x"].astype(float), s["particles.u"].astype(float) + s["particles.vk"]
     return np.concatenate([(mass * v).sum(1), (mass * np.cross(x, v)).sum(1)], axis=1)
 
 
 def test_a_floating_body_keeps_its_momentum(make_batch):
-    """Shape, tone and commanded motion give back what they take: by bone masses that are those of the particles."""
+    # Shape, tone and commanded motion give back what they take: by bone masses that are those of the particles.
     batch = make_batch(REACH, 3, **FREE, **VARIED, **{"shape.randomize": True, "scene.ground": False})
     batch.reset(seeds=[1, 2, 3])
     state = batch.get_state()
@@ -239,28 +173,8 @@ def test_the_root_carries_the_drawn_weight(make_batch):
     assert force == pytest.approx(weight, rel=0.02) and np.ptp(weight) > 50.0
 
 
-@pytest.mark.parametrize("limit", ["force", "torque"])
-def test_limits_of_the_root_are_in_drawn_weights(make_batch, limit):
-    """A command too far away: the wrench is as large as it may be, over the body's own weight."""
-    settings = {"pose_noise": 0.0, "gravity": 0.0, "max_root_force": 0.5, "max_root_torque": 0.05, **VARIED}
-    batch = make_batch(REACH, 3, **settings)
-    batch.reset(seeds=[5, 6, 7])
-    batch.action.zero_()
-    state = batch.get_state()
-    if limit == "force":
-        state["avatar_0.state.command_root"][:, 0] += 0.4
-    else:
-        state["avatar_0.state.command_rotation"][:, 0] = np.float32([np.sin(0.3), 0.0, 0.0, np.cos(0.3)])
-    batch.set_state(state)
-    batch.step()
-    drive = batch.simulation.avatar.state
-    wrench = np.linalg.norm(getattr(drive, f"wrench_{limit}").numpy(), axis=1)
-    share = {"force": 0.5, "torque": 0.05}[limit]
-    assert wrench == pytest.approx(share * 9.81 * constants_of(batch)["mass"].sum(1), rel=5e-3)
-
-
 def test_things_slide_by_the_drawn_friction(make_batch):
-    """A box on the floor loses ``factor mu g`` of its speed a second."""
+    # A box on the floor loses ``factor mu g`` of its speed a second.
     box = {"name": "box", "shape": "box", "size": (0.3, 0.3, 0.3), "friction": 0.4, "mass": 100.0}
     box |= {"position": (0.0, -1.2, 0.3), "velocity": (1.5, 0.0, 0.0)}
     batch = make_batch(REACH, 3, **VARIED, **{"scene.props": [box]})
@@ -277,7 +191,7 @@ def test_things_slide_by_the_drawn_friction(make_batch):
 
 
 def test_bodies_rub_by_the_drawn_friction(make_batch):
-    """A box on a slab that stays loses speed as the drawn coefficient says, as well as soft bodies at tiny can."""
+    # A box on a slab that stays loses speed as the drawn coefficient says, as well as soft bodies at tiny can.
     slab = {"name": "slab", "shape": "box", "size": (0.55, 0.45, 0.25), "friction": 5.0, "mass": 400.0}
     box = {"name": "box", "shape": "box", "size": (0.28, 0.28, 0.2), "mass": 30.0, "velocity": (1.2, 0.0, 0.0)}
     props = [slab | {"position": (0.2, -1.2, 0.25)}, box | {"position": (0.0, -1.2, 0.71)}]
@@ -306,9 +220,10 @@ def everything(batch, steps: int) -> list[np.ndarray]:
     return log
 
 
-def test_a_restored_state_brings_what_was_drawn(make_batch, env_id, equal):
+@pytest.mark.parametrize("task", [REACH, "PIAvatar/KickBall-v0"])
+def test_a_restored_state_brings_what_was_drawn(make_batch, task, equal):
     settings = {"observe_parameters": True, "shape.randomize": True, **VARIED}
-    batch = make_batch(env_id, 2, **settings)
+    batch = make_batch(task, 2, **settings)
     batch.reset(seeds=[3, 4])
     state, constants = batch.get_state(), constants_of(batch)
     expected = everything(batch, 4)

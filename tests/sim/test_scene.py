@@ -5,23 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.body.sampling import LIMB_GROUPS
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.mpm.materials import material_index
-from piavatar_envs.sim.scene import FALL, Domain
+from piavatar_envs.sim.scene import Domain
 from piavatar_envs.sim.world import Simulation
 
 BALL = {"name": "ball", "mass": 0.5, "position": [0.0, -1.0, 1.0]}
 
 
 def world(device, num_envs=1, **scene) -> Simulation:
-    """A world of tiny bodies."""
+    """Return a world of tiny bodies."""
     return Simulation(load_config(EnvConfig, None, {"fidelity": "tiny", "scene": scene}), num_envs, device)
 
 
-@pytest.mark.parametrize("count", [1, 2, 4])
-def test_as_many_avatars_as_the_scene_says(device, count):
+def test_as_many_avatars_as_the_scene_says(device):
+    count = 3
     avatars = [{"position": [0.8 * index, 0.0], "yaw": 0.5 * index} for index in range(count)]
     simulation = world(device, avatars=avatars)
     single = world(device)
@@ -34,13 +33,6 @@ def test_as_many_avatars_as_the_scene_says(device, count):
         assert (field[first[index] : first[index + 1]] == index).all()
     upper = np.asarray(simulation.model.grid.origin) + simulation.dx * (np.asarray(simulation.model.grid.nodes) - 2)
     assert upper[0] >= Domain().upper[0] + 0.8 * (count - 1) - 1e-3
-
-
-@pytest.mark.parametrize(("fenced", "walled", "stays"), [(1, 1, True), (1, 0, False), (0, 1, False), (0, 0, False)])
-def test_only_ropes_that_stand_there_take_the_room_to_fall(fenced, walled, stays):
-    domain = Domain(fenced=bool(fenced))
-    room = np.array(domain.for_falls(bool(walled)).upper) - domain.upper
-    assert room == pytest.approx([0.0] * 3 if stays else [FALL, FALL, 0.0])
 
 
 def test_avatars_have_settings_of_their_own(device):
@@ -91,24 +83,14 @@ def test_regions_are_of_another_material(device):
     assert density[ankle] == pytest.approx(1200.0, rel=1e-4) and density[~ankle] == pytest.approx(1000.0, rel=1e-4)
 
 
-def test_limbs_are_fields_of_their_own(device):
-    simulation = world(device, self_contact=True, avatars=[{}, {"position": [1.0, 0.0]}], props=[BALL])
-    fields = simulation.subjects.fields
-    assert fields.subject == (0,) * len(LIMB_GROUPS) + (1,) * len(LIMB_GROUPS) + (2,)
-    assert np.unique(simulation.model.particles.field.numpy()).tolist() == list(range(11))
-    trunk = simulation.model.contact.trunk.numpy()
-    assert trunk.tolist() == [0] * 5 + [5] * 5 + [10]
-
-
 def test_props_begin_inside_the_domain(device):
-    """One that reaches less than half a grid spacing out is pushed back; the message says where it is inside."""
-    for place, told in {
-        (3.0, -1.0, 1.0): r"prop 'ball' would begin at \[3.0, -1.0, 1.0\] m and .* ends at x=-1.6 and 1.6 m; place it "
-        r"with x in \[-1.52, 1.52\] m",
-        (0.0, -1.65, 1.0): "ends at y=-1.6 and 1.6 m",
-        (0.0, -1.0, 2.65): "ends at z=-0.3 and 2.6 m",
+    # One that reaches less than half a grid spacing out is pushed back; the message says where it is inside.
+    for place, message in {
+        (3.0, -1.0, 1.0): r"'ball' .*x=-1.6 and 1.6 m.* x in \[-1.52, 1.52\] m",
+        (0.0, -1.65, 1.0): "y=-1.6 and 1.6 m",
+        (0.0, -1.0, 2.65): "z=-0.3 and 2.6 m",
     }.items():
-        with pytest.raises(ConfigError, match=told):
+        with pytest.raises(ConfigError, match=message):
             world(device, props=[{**BALL, "position": place}])
     edge = Domain().upper[1] - 0.08 + 0.4 * world(device).dx
     world(device, props=[{**BALL, "position": (0.0, edge, 1.0)}])
@@ -132,7 +114,7 @@ def test_props_begin_inside_the_domain(device):
     ],
 )
 def test_places_that_episodes_draw_are_inside_the_domain(make_batch, task, settings, axis):
-    with pytest.raises(ConfigError, match=f"would begin at .* reach out of the domain, which ends at {axis}=.* m;"):
+    with pytest.raises(ConfigError, match=f"out of the domain, which ends at {axis}="):
         make_batch(task, **settings)
 
 
@@ -206,39 +188,31 @@ RUBS = {"a": "ball", "b": "agent_0", "friction": 0.1}
 
 
 @pytest.mark.parametrize(
-    ("scene", "told"),
+    ("scene", "message"),
     [
         ({"props": [BALL, BALL]}, "'ball' is given twice"),
-        ({"props": [BALL | {"name": "ground"}]}, "'ground' is given twice"),
-        ({"props": [BALL | {"size": [0.1, 0.2]}]}, "prop ball: size.*1 numbers"),
-        ({"props": [BALL | {"shape": "mesh", "size": [1.0]}]}, "prop ball: .*needs a file"),
-        ({"props": [BALL | {"mass": -1.0}]}, "mass=-1.0 must be >= 1e-06"),
+        ({"props": [BALL | {"size": [0.1, 0.2]}]}, "ball: size"),
+        ({"props": [BALL | {"shape": "mesh", "size": [1.0]}]}, "ball: .*file"),
+        ({"props": [BALL | {"mass": -1.0}]}, "mass=-1.0"),
         ({"props": [{"shape": "sphere"}]}, "name is missing"),
-        (
-            {"props": [BALL], "pair_friction": [RUBS, RUBS | {"a": "agent_0", "b": "ball"}]},
-            "'ball' are given twice",
-        ),
-        ({"props": [BALL], "pair_friction": [RUBS | {"b": "ball"}]}, "'ball' .*itself; leave it out$"),
+        ({"props": [BALL], "pair_friction": [RUBS, RUBS | {"a": "agent_0", "b": "ball"}]}, "'ball' are given twice"),
+        ({"props": [BALL], "pair_friction": [RUBS | {"b": "ball"}]}, "'ball' .*itself"),
         ({"pair_friction": [RUBS | {"a": "agent_0"}]}, "'agent_0' .*itself; .*self_contact=true"),
         ({"colliders": [POST], "pair_friction": [RUBS | {"a": "ground", "b": "post"}]}, "'ground' and 'post' .*solids"),
         ({"props": [BALL, BALL | {"name": "twin"}]}, "'ball' would begin at .* inside 'twin'"),
-        (
-            {"props": [BALL, {"name": "crate", "shape": "box", "size": [0.4, 0.3, 0.3]}]},
-            "inside 'crate'",
-        ),
-        ({"props": [BALL | {"rotation": [0, 0, 0, 0]}]}, "must be a quaternion wxyz, not zero"),
-        ({"pair_friction": [RUBS]}, "there is no 'ball'"),
-        ({"avatars": [{"control": {"tone": 2.0}}]}, "tone=2.0 must be <= 1"),
-        ({"avatars": [{"control": {"tune": 0.2}}]}, "control.tune is no setting"),
-        ({"avatars": [{"physics": {"fidelity": "fine"}}]}, "fidelity cannot differ between avatars"),
-        ({"avatars": [{"regions": [{"joints": ["tail"]}]}]}, "unknown joint 'tail'"),
+        ({"props": [BALL | {"rotation": [0, 0, 0, 0]}]}, "quaternion wxyz"),
+        ({"pair_friction": [RUBS]}, "no 'ball'"),
+        ({"avatars": [{"control": {"tone": 2.0}}]}, "tone=2.0"),
+        ({"avatars": [{"control": {"tune": 0.2}}]}, "control.tune"),
+        ({"avatars": [{"physics": {"fidelity": "fine"}}]}, "fidelity"),
+        ({"avatars": [{"regions": [{"joints": ["tail"]}]}]}, "'tail'"),
         ({"avatars": [{"regions": [{"joints": ["head"], "beyond": 3.0}]}]}, "'head'.*beyond=3.0 m"),
         ({"avatars": [{"position": [float(k), 0.0]} for k in range(7)], "self_contact": True}, "35 velocity fields"),
-        ({"colliders": [{"name": "post", "kind": "capsule", "size": [0.1]}]}, "capsule must be 2 positive"),
+        ({"colliders": [{"name": "post", "kind": "capsule", "size": [0.1]}]}, "capsule must be 2"),
     ],
 )
-def test_what_cannot_be_is_refused(device, scene, told):
-    with pytest.raises((ConfigError, ValueError), match=told):
+def test_what_cannot_be_is_refused(device, scene, message):
+    with pytest.raises((ConfigError, ValueError), match=message):
         world(device, **scene)
 
 
@@ -248,7 +222,7 @@ def test_a_task_with_one_avatar_takes_no_second(make_env):
 
 
 def test_any_task_takes_more_props_and_colliders(make_env):
-    """A ball dropped beside the avatar falls freely, then rests on the floor; a kinematic box goes its way."""
+    # A ball dropped beside the avatar falls freely, then rests on the floor; a kinematic box goes its way.
     scene = {
         "props": [BALL | {"position": [0.9, 0.0, 1.0], "size": [0.2]}],
         "colliders": [{"name": "lift", "size": [0.1, 0.1, 0.1], "position": [-1.2, 0.0, 0.5], "velocity": [0, 0, 0.3]}],
@@ -270,18 +244,18 @@ def test_any_task_takes_more_props_and_colliders(make_env):
     assert state.position.numpy()[0, 0] == pytest.approx([0.9, 0.0, 1.0], abs=1e-5)
 
 
-def test_a_ball_that_hits_is_felt_where_it_hits(make_env):
-    """Thrown at the chest: what the torso feels is what the ball has lost, and it is in the saved state."""
+def test_a_ball_that_hits_is_sensed_where_it_hits(make_env):
+    # Thrown at the chest: the torso senses the momentum that the ball loses.
     ball = {"name": "ball", "mass": 2.0, "size": [0.2], "position": [0.0, -0.8, 1.2], "velocity": [0.0, 6.0, 0.0]}
     env = make_env("PIAvatar/Reach-v0", pose_noise=0.0, scene={"props": [ball]}, gravity=0.0)
     env.reset(seed=0)
     simulation = env.batch.simulation
-    felt, before = np.zeros((len(BODY_PARTS), 3)), simulation.props.state.velocity.numpy()[0, 0].copy()
+    sensed, before = np.zeros((len(BODY_PARTS), 3)), simulation.props.state.velocity.numpy()[0, 0].copy()
     for _ in range(12):
         env.step(np.zeros(env.action_space.shape))
-        felt += simulation.sensors.part_impulse.numpy()[0, :, 1]
+        sensed += simulation.sensors.part_impulse.numpy()[0, :, 1]
     lost = 2.0 * (before - simulation.props.state.velocity.numpy()[0, 0])
     assert lost[1] > 6.0  # it has hit
-    assert felt.sum(0) == pytest.approx(lost, abs=0.02 * float(np.abs(lost).max()))
-    parts = dict(zip(BODY_PARTS, np.linalg.norm(felt, axis=1), strict=True))
+    assert sensed.sum(0) == pytest.approx(lost, abs=0.02 * float(np.abs(lost).max()))
+    parts = dict(zip(BODY_PARTS, np.linalg.norm(sensed, axis=1), strict=True))
     assert parts["torso"] > 0.8 * sum(parts.values())

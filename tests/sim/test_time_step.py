@@ -26,24 +26,23 @@ def world(device, **settings) -> Simulation:
 
 
 def substep_way(simulation: Simulation, speed: float) -> float:
-    """How far something goes in a substep [grid spacings]."""
+    """Return the distance in a substep at a speed [grid spacings]."""
     return speed * float(simulation.model.step.dt) / simulation.dx
 
 
 def test_no_default_has_other_substeps_than_its_waves_ask_for(device):
+    # Under pose control at any fidelity alike: the steps of waves and of moving parts go with the grid spacing.
     tasks = [load_task(env_id) for env_id in task_modules()]
     if importlib.util.find_spec("pettingzoo"):
         tasks += [load_game(name).TASK for name in listed_games()]
-    found = {}
     for cls in tasks:
-        task = cls(load_config(cls.Config))
+        fidelity = "tiny" if load_config(cls.Config).control.mode == "pose" else "coarse"
+        task = cls(load_config(cls.Config, None, {"fidelity": fidelity}))
         world_of = task.config, 1, device, task.domain(), task.scene
         simulation = Simulation(*world_of, avatar_names=task.agent_names, impulses=task.impulses())
         model, physics = simulation.model, task.config.physics
         wave = choose_num_substeps(physics.control_dt, simulation.dx, model.sound_speed, physics.cfl)
-        assert model.num_substeps == wave
-        found[cls.__name__] = model.num_substeps
-    assert set(found.values()) == {15}, found
+        assert model.num_substeps == wave, cls.__name__
 
 
 def test_a_chain_of_joints_adds_up_what_they_are_from_its_end():
@@ -63,10 +62,8 @@ def test_a_chain_of_joints_adds_up_what_they_are_from_its_end():
     [
         ({"props": [BALL | {"velocity": [0.0, 40.0, 30.0]}]}, 50.0),
         ({"props": [BALL | {"spin": [0.0, 0.0, 400.0]}]}, 400.0 * 0.08),
-        ({"props": [BALL | {"top_speed": 60.0}]}, 60.0),
         ({"colliders": [POST | {"velocity": [0.0, 30.0, 0.0]}]}, 30.0),
         ({"colliders": [POST | {"spin": [0.0, 0.0, 200.0]}]}, 40.0),
-        ({"colliders": [POST | {"kind": "box", "size": [0.1, 0.1, 0.1], "spin": [300.0, 0.0, 0.0]}]}, 51.9),
         ({"colliders": [POST | {"kind": "capsule", "size": [0.1, 0.3], "spin": [99.0, 0.0, 0.0]}]}, 39.6),
         ({"colliders": [POST | {"kind": "plane", "size": [], "position": [0, 0, -0.2], "spin": [9.0, 0, 0]}]}, 28.6),
         ({"colliders": [POST | {"top_speed": 60.0}]}, 60.0),
@@ -76,14 +73,6 @@ def test_fast_things_go_less_than_a_grid_spacing_in_a_substep(device, scene, spe
     plain = substep_way(world(device), speed)
     assert plain > 1.0 / STRUCK, "it would have been slow enough anyway"
     assert 0.6 / STRUCK < substep_way(world(device, scene=scene), speed) <= 1.0 / STRUCK + 1e-6
-
-
-def test_what_falls_is_fast_in_the_end(device):
-    scene = {"props": [BALL | {"velocity": [0.0, 12.0, 0.0]}]}
-    assert world(device, scene=scene, gravity=0.0).model.num_substeps == world(device).model.num_substeps
-    simulation = world(device, scene=scene, gravity=80.0)
-    drop = simulation.domain.upper[2] - simulation.domain.lower[2]
-    assert substep_way(simulation, math.sqrt(12.0**2 + 2.0 * 80.0 * drop)) <= 1.0 / STRUCK + 1e-6
 
 
 @pytest.mark.parametrize(
@@ -96,7 +85,7 @@ def test_what_falls_is_fast_in_the_end(device):
     ],
 )
 def test_they_do_not_end_episodes(make_env, task, settings):
-    """All of these ended with the failure ``cfl`` in the step in which they became so fast."""
+    # All of these ended with the failure ``cfl`` in the step in which they became so fast.
     env = make_env(task, **settings)
     env.reset(seed=0)
     for _ in range(25):
@@ -124,14 +113,13 @@ def test_too_few_substeps_are_refused_with_the_number_that_would_do(device):
         world(device, young_modulus=1e9, density=0.1)
 
 
-@pytest.mark.parametrize("impulse", [100.0, 200.0])
-def test_flesh_that_gets_a_great_impulse_goes_less_than_a_cell_in_a_substep(make_batch, impulse):
-    """Of 2 kg in a shoulder 200 N s make 100 m/s; in the default's substeps bodies ended in the failure ``cfl``."""
-    batch = make_batch("PIAvatar/TrackMotion-v0", 6, impulse=impulse, impulse_interval=0.3)
-    simulation, usual = batch.simulation, make_batch("PIAvatar/TrackMotion-v0", 6, impulse_interval=0.3).simulation
+def test_flesh_that_gets_a_great_impulse_goes_less_than_a_cell_in_a_substep(make_batch):
+    # Of 2 kg in a shoulder 200 N s make 100 m/s; in the default's substeps bodies ended in the failure ``cfl``.
+    batch = make_batch("PIAvatar/TrackMotion-v0", 4, impulse=200.0, impulse_interval=0.3)
+    simulation, usual = batch.simulation, make_batch("PIAvatar/TrackMotion-v0", 1).simulation
     assert simulation.model.num_substeps > 1.5 * usual.model.num_substeps
-    batch.reset(seeds=list(range(6)))
-    for _ in range(40):
+    batch.reset(seeds=list(range(4)))
+    for _ in range(30):
         batch.action.zero_()
         batch.step()
     assert batch.failure.numpy().sum() == 0
