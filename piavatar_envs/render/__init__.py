@@ -4,8 +4,7 @@ from piavatar_envs.render.coloring import strain_magnitude
 from piavatar_envs.render.overlay import label, side_by_side
 from piavatar_envs.render.renderer import Renderer
 from piavatar_envs.render.scene import PALETTE, PROP, Arrow, Body, Box, Camera, Capsule, Marker, Ring, Scene, Sphere
-from piavatar_envs.render.skin import Skin
-from piavatar_envs.render.solid import SolidSurface
+from piavatar_envs.render.skin import Skin, SolidSurface
 from piavatar_envs.render.video import write_video
 
 __all__ = [

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from piavatar_envs.render.geometry import Topology
-from piavatar_envs.render.shadow import GroundShadow
+from piavatar_envs.render.ground import GroundShadow
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,18 @@
-"""Colours: strain of the deformation gradient, a perceptually uniform colour map and its scale."""
+"""Colours: strain, a perceptually uniform map and its scale, and bodies in bands of one colour."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from piavatar_envs.render.scene import Body, Color
+
 _TABLE_SIZE = 256
+#: Colours of a body where the viewer has no colours of vertices.
+NUM_BANDS = 16
 #: Anchors (lightness, chroma, hue [deg]) of the strain map in Oklch: pale where unstrained, so that the body still
 #: reads as a body; then orange, crimson and a dark violet, in equal steps of lightness.
 _STRAIN_ANCHORS = np.array(
@@ -109,3 +114,38 @@ def oklab_to_srgb(lab: ArrayLike) -> np.ndarray:
         ]
     )
     return linear_to_srgb((lab @ to_lms.T) ** 3 @ to_rgb.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The triangles of a body between two strains.
+
+    Attributes:
+        number: of the band, counted from the least strain.
+        vertices: theirs alone [m], shape ``(V, 3)``.
+        faces: the triangles, shape ``(T, 3)``.
+        color: sRGB in [0, 1], of the middle of the band.
+    """
+
+    number: int
+    vertices: np.ndarray
+    faces: np.ndarray
+    color: Color
+
+
+def bands_of(body: Body) -> list[Band]:
+    """Split the body into bands of equal width in its scalars; bands without triangles are left out.
+
+    A triangle belongs where the mean of its corners does; beyond the range, and NaN, to the last band.
+    """
+    middles = (np.arange(NUM_BANDS) + 0.5) / NUM_BANDS
+    colors = color_by(middles, 1.0)
+    share = np.nan_to_num(np.asarray(body.scalars)[body.faces].mean(axis=1) / body.scalar_max, nan=1.0, posinf=1.0)
+    band = np.clip(share * NUM_BANDS, 0.0, NUM_BANDS - 1.0).astype(np.int64)
+    found = []
+    for number in np.unique(band):
+        own = body.faces[band == number]
+        used, corners = np.unique(own, return_inverse=True)
+        faces = corners.reshape(-1, 3).astype(np.int32)
+        found.append(Band(int(number), np.asarray(body.vertices)[used], faces, tuple(colors[number])))
+    return found

@@ -14,11 +14,9 @@ from typing import TYPE_CHECKING, TextIO
 import numpy as np
 
 from piavatar_envs.render import ground
-from piavatar_envs.render.bands import bands_of
-from piavatar_envs.render.coloring import strain_table
-from piavatar_envs.render.follow import Follower
+from piavatar_envs.render.coloring import bands_of, strain_table
 from piavatar_envs.render.geometry import drawable
-from piavatar_envs.render.scene import Camera, Color, Scene
+from piavatar_envs.render.scene import Camera, Color, Follower, Scene
 from piavatar_envs.render.shading import KEY
 
 if TYPE_CHECKING:

@@ -10,11 +10,10 @@ import numpy as np
 from piavatar_envs.render import coloring, shading, vtk_backend
 from piavatar_envs.render.backend import Backend, Shot
 from piavatar_envs.render.display import opengl_available
-from piavatar_envs.render.follow import Follower
 from piavatar_envs.render.geometry import Topology, drawable, topology_key
+from piavatar_envs.render.ground import ground_shadow
 from piavatar_envs.render.overlay import draw_scale
-from piavatar_envs.render.scene import Body, Camera, Marker
-from piavatar_envs.render.shadow import ground_shadow
+from piavatar_envs.render.scene import Body, Camera, Follower, Marker
 
 BACKENDS = ("auto", "pyvista", "software")
 

@@ -1,4 +1,4 @@
-"""The skin for pictures: linear blend skinning plus the simulated particles' displacement.
+"""Surfaces for pictures: the skin of an avatar, by linear blend skinning plus the particles' displacement, and props.
 
 The particles fill the body; the skin mesh is not simulated. Each skin vertex therefore follows its bones, and adds
 the displacement ``x - LBS`` of the particles beneath it. Which particles, and with which weights, is baked once.
@@ -21,6 +21,8 @@ NUM_NEIGHBOURS = 24
 _CANDIDATES = (64, 256)
 #: A particle with less than this share of the best candidate's overlap moves with other bones: leave it out.
 _MIN_RELATIVE_OVERLAP = 0.05
+#: Particles that move a vertex of a prop.
+_PROP_NEIGHBOURS = 6
 
 
 class SkinnedSurface(Protocol):
@@ -188,3 +190,32 @@ def _select(
     weights = overlap * (1.0 - np.minimum(distance / support, 1.0) ** 2) ** 2
     weights, index = weights[:, :num_neighbours], index[:, :num_neighbours]
     return index, weights / weights.sum(axis=1, keepdims=True)
+
+
+class SolidSurface:
+    """Deforms the surface mesh of one prop with its particles."""
+
+    def __init__(self, rest: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
+        """Bake the weights: a vertex moves with its nearest particles, the nearer the more.
+
+        Args:
+            rest: particles in the rest frame [m], shape ``(P, 3)``.
+            vertices: surface in the same frame [m], shape ``(V, 3)``.
+            faces: its triangles, shape ``(T, 3)``.
+        """
+        self.vertices, self.faces = np.asarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)
+        self._rest = np.asarray(rest, np.float64)
+        distance, self._near = cKDTree(self._rest).query(self.vertices, k=min(_PROP_NEIGHBOURS, len(rest)))
+        weight = 1.0 / np.maximum(distance, 1e-6) ** 2
+        self._weight = weight / weight.sum(axis=1, keepdims=True)
+
+    def deform(self, rotation: np.ndarray, position: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return world vertices [m], shape ``(V, 3)``.
+
+        Args:
+            rotation: rest frame to world, shape ``(3, 3)``.
+            position: centre of mass [m].
+            x: particles in the world [m], shape ``(P, 3)``.
+        """
+        dent = x - (self._rest @ rotation.T + position)
+        return self.vertices @ rotation.T + position + (self._weight[..., None] * dent[self._near]).sum(1)

@@ -11,8 +11,8 @@ import warp as wp
 from piavatar_envs.render import ground
 from piavatar_envs.render.backend import Shot
 from piavatar_envs.render.geometry import Topology
+from piavatar_envs.render.ground import GroundShadow
 from piavatar_envs.render.raster import SAMPLES, GroundLook, View, rasterise, resolve
-from piavatar_envs.render.shadow import GroundShadow
 
 
 class SoftwareBackend:

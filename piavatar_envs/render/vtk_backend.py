@@ -10,7 +10,7 @@ from piavatar_envs.render import ground
 from piavatar_envs.render.backend import Shot
 from piavatar_envs.render.display import off_screen_window
 from piavatar_envs.render.geometry import Topology
-from piavatar_envs.render.shadow import GroundShadow
+from piavatar_envs.render.ground import GroundShadow
 
 _SUPERSAMPLING = 2
 _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs.render import Arrow, Body, Camera, Scene, Sphere
-from piavatar_envs.render.bands import NUM_BANDS, bands_of
-from piavatar_envs.render.coloring import color_by
+from piavatar_envs.render.coloring import NUM_BANDS, bands_of, color_by
 from piavatar_envs.render.live import LiveView
 
 GREEN = (0.0, 1.0, 0.0)
