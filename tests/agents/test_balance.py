@@ -84,11 +84,6 @@ def test_the_hips_reach_further_by_their_torque_and_only_beyond_the_threshold():
     assert (np.abs(balance.step(np.array([[9.0, -9.0]]), np.zeros((1, 2))).hip) == limit).all()
 
 
-def pushes(torques: np.ndarray, axis: int, names: tuple[str, ...]) -> float:
-    """Sum over joints of the torque about an axis, of joints by name."""
-    return sum(torques[0, joint_index(name) - 1, axis] for name in names)
-
-
 def test_torques_of_the_ankles_press_where_the_centre_of_pressure_is_wanted():
     """A foot that is turned by r x F presses the ground with F at r: forward is -y, left is +x."""
     pressure = np.array([[0.1, 0.02]])
@@ -101,28 +96,3 @@ def test_torques_of_the_ankles_press_where_the_centre_of_pressure_is_wanted():
     ankles = [torques[0, joint_index(f"{side}_ankle") - 1] for side in ("left", "right")]
     np.testing.assert_allclose(sum(ankles), wanted, atol=1e-9)
     assert np.count_nonzero(torques) == 4
-
-
-def test_hips_push_pelvis_and_legs_sideways_as_the_ankles_would():
-    """Without ankles: a torque T about y on a leg of length h asks for a force T / h of the ground on it, leftward."""
-    narrow = Stance(70.0, 0.9, 0.06, 0.18, 0.14, foot_width=1e-9)
-    pressure = np.array([[0.0, 0.05]])
-    effort = Effort(pressure, 70.0 * GRAVITY * pressure, np.zeros((1, 2)), np.zeros((1, 2)))
-    torques = Balance(narrow).joint_torques(effort)
-    force = pushes(torques, 1, ("left_hip", "right_hip")) / 0.9
-    # the pendulum with its pressure to the left is pushed to the right: x'' = -w^2 p
-    assert force / 70.0 == pytest.approx(-(W**2) * 0.05, rel=1e-6)
-    wide = Balance(STANCE).joint_torques(effort)  # feet of 8 cm bear 4 of the 5 cm
-    assert pushes(wide, 1, ("left_hip", "right_hip")) == pytest.approx(-70.0 * GRAVITY * 0.01)
-    assert pushes(wide, 1, ("left_ankle", "right_ankle")) == pytest.approx(70.0 * GRAVITY * 0.04)
-
-
-def test_the_hip_strategy_turns_the_trunk_with_the_fall():
-    """The legs get the reaction of the trunk's torque: forward is a turn about +x, to the left one about +y."""
-    effort = Effort(np.zeros((1, 2)), np.zeros((1, 2)), np.array([[30.0, -20.0]]), np.zeros((1, 2)))
-    torques = Balance(STANCE).joint_torques(effort)
-    assert pushes(-torques, 0, ("left_hip", "right_hip")) == pytest.approx(30.0)
-    assert pushes(-torques, 1, ("left_hip", "right_hip")) == pytest.approx(-20.0)
-    # +x brings the head (+z) forward (-y), +y brings it to the left (+x)
-    np.testing.assert_allclose(np.cross([1, 0, 0], [0, 0, 1]), [0, -1, 0])
-    np.testing.assert_allclose(np.cross([0, 1, 0], [0, 0, 1]), [1, 0, 0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agents.pid.bones import NUM_DOF, Bones, Posture, answered, force_moments, in_bones
+from agents.pid.bones import NUM_DOF, Bones, Posture, force_moments, in_bones
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 
 GRAVITY = 9.81
@@ -77,31 +77,3 @@ def test_moments_of_weight_and_of_forces_do_the_work_that_they_do(bones, local):
     speed = linear[:, foot] + np.cross(spin[:, foot], place - now.centres[:, foot])
     moments = in_bones(now, force_moments(now, foot, place, force))[:, 1:]
     np.testing.assert_allclose(np.einsum("nbi,bi->n", moments, own), (force * speed).sum(1), rtol=1e-6)
-
-
-def energies(bones: Bones, local: np.ndarray, together: bool, steps: int = 60, dt: float = 1.0 / 30.0) -> np.ndarray:
-    """Kinetic energy about a pose, under strong dampers whose torque is held for a step, ``(steps + 1,)``."""
-    matrix = bones.mass_matrix(bones.posture(local))[:1]
-    damping = 40.0
-    added = np.full((1, NUM_JOINTS - 1, 3), dt * damping)
-    velocity = np.zeros((1, NUM_DOF))
-    velocity[0, 6:] = 0.1
-    found = [0.5 * velocity[0] @ matrix[0] @ velocity[0]]
-    for _ in range(steps):
-        torque = -damping * velocity[:, 6:].reshape(1, -1, 3)
-        if together:
-            torque = answered(matrix, torque, added)
-        else:
-            own = np.diagonal(matrix, axis1=1, axis2=2)[:, 6:].reshape(torque.shape)
-            torque = torque / (1.0 + added / own)
-        force = np.concatenate([np.zeros((1, 6)), torque.reshape(1, -1)], axis=1)
-        velocity = velocity + dt * np.linalg.solve(matrix, force[..., None])[..., 0]
-        found.append(0.5 * velocity[0] @ matrix[0] @ velocity[0])
-    return np.array(found)
-
-
-def test_dampers_that_know_of_their_own_inertia_only_drive_a_chain(bones, local):
-    """Held for a step they give it energy, each right for itself; those that answer together only take it."""
-    alone, together = (energies(bones, local, together) for together in (False, True))
-    assert alone[-1] > 1e6 * alone[0]
-    assert (np.diff(together) < 0.0).all()

@@ -60,21 +60,6 @@ def test_it_falls_after_success_and_rises_after_failure(device, task, expected):
     env.close()
 
 
-@pytest.mark.parametrize("how", ["rollouts: 3", "step: 0.2"])
-def test_a_resumed_training_has_the_assist_of_an_uninterrupted_one(device, tmp_path, capsys, how):
-    command = [*FEW, f"assist={{first: 0.5, {how}}}", "--device", device, "--out"]
-    rsl_ppo.main([*command[:-3], "iterations=4", *command[-3:], str(tmp_path / "whole")])
-    parts = str(tmp_path / "parts")
-    rsl_ppo.main([*command[:-3], "iterations=2", *command[-3:], parts])
-    rsl_ppo.main([*command[:-3], "iterations=4", *command[-3:], parts, "--resume"])
-    rsl_ppo.main([*FEW, "iterations=4", *command[-3:], str(tmp_path / "alone")])
-    whole, resumed, alone = (
-        torch.load(tmp_path / run / "policy.pt", weights_only=True) for run in ("whole", "parts", "alone")
-    )
-    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
-    assert not all(torch.equal(whole[name], alone[name]) for name in whole)
-
-
 def test_curricula_are_for_training_only(device, tmp_path, capsys):
     setting = "curriculum={pose_noise: 0.3, control.root_assist: 0.1}"
     config = load_batched(RslTraining, load_task, FEW[0], parse_assignments([*FEW[1:], setting]))

@@ -7,7 +7,6 @@ import copy
 import numpy as np
 import pytest
 import torch
-from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -15,8 +14,7 @@ from agents.evaluate import evaluate, zero_agent
 from agents.sb3 import ppo
 from agents.sb3.matches import seated
 from agents.sb3.parallel import WAITING, AgentVecEnv, WorldFactory
-from agents.sb3.ppo import MarkPlayed, PlayedBuffer, PPOSettings
-from agents.sb3.workers import start_workers
+from agents.sb3.ppo import MarkPlayed, PPOSettings
 from tests.agents.games.ledger_v0 import LEAVES, TERMINATED, Ledger
 
 LEDGER = WorldFactory("tests.agents.games.ledger_v0", {})
@@ -142,45 +140,6 @@ def test_advantages_are_those_of_each_agents_own_episodes(peek):
                 expected[t] = advantage
             found = peek.buffer.advantages[first : first + length, slot]
             np.testing.assert_allclose(found, expected, rtol=1e-4)
-
-
-@pytest.mark.parametrize("batch_size", [4, 12, None])
-def test_where_all_play_the_minibatches_are_the_usual_ones(folded, batch_size):
-    spaces = folded.observation_space, folded.action_space
-    usual, mine = (kind(4, *spaces, device="cpu", n_envs=6) for kind in (RolloutBuffer, PlayedBuffer))
-    rng = np.random.default_rng(0)
-    for _ in range(4):
-        step = [rng.normal(size=(6, n)).astype(np.float32) for n in (4, 1)]
-        rest = [rng.normal(size=6).astype(np.float32) for _ in range(2)]
-        more = [torch.as_tensor(rng.normal(size=6)) for _ in range(2)]
-        for buffer in (usual, mine):
-            buffer.add(*step, *rest, *more)
-    mine.played[:] = True
-    batches = []
-    for buffer in (usual, mine):
-        np.random.seed(3)
-        batches.append(list(buffer.get(batch_size)))
-    assert len(batches[0]) == len(batches[1])
-    for a, b in zip(*batches, strict=True):
-        assert all(torch.equal(x, y) for x, y in zip(a[:6], b[:6], strict=True))
-
-
-def test_worlds_in_processes_play_as_those_in_this_one():
-    traces = []
-    for workers in (DummyVecEnv([LEDGER] * 2), start_workers(LEDGER, 2)):
-        venv = AgentVecEnv(workers)
-        try:
-            venv.seed(7)
-            trace = [venv.reset()]
-            for step in range(LAST + 2):
-                actions = np.linspace(-1.0, 1.0, 6, dtype=np.float32)[:, None] / (step + 1)
-                observation, rewards, dones, infos = venv.step(actions)
-                trace += [observation, rewards, dones, [WAITING in info for info in infos]]
-        finally:
-            venv.close()
-        traces.append(trace)
-    for a, b in zip(*traces, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_opponents_act_for_those_who_do_not_learn():

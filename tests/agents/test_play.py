@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 import zipfile
 
 import numpy as np
@@ -14,49 +15,16 @@ pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
 from agents import play, scores  # noqa: E402
 from agents.play import open_run  # noqa: E402
-from agents.sb3 import train  # noqa: E402
 from piavatar_envs.api.host import EpisodeHost  # noqa: E402
 from piavatar_envs.config import load_config  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 
-QUICK = ("env.fidelity=tiny", "env.episode_seconds=0.2", "evaluation.episodes=3")
-SB3 = {
-    "ppo": ("configs/sb3/reach_sb3.yaml", "total_steps=16", "num_workers=2", "ppo.rollout_steps=8", "ppo.batch_size=8"),
-    "sac": ("configs/sb3/reach_sac.yaml", "total_steps=16", "num_workers=2", "sac.first_random=4", "sac.batch_size=4"),
-}
 
-
-def run_of(kind: str, folder, device: str) -> None:
-    """A short training."""
-    if kind == "rsl":
-        for needed in ("rsl_rl", "tensordict", "git"):
-            pytest.importorskip(needed, reason="needs the extra rsl")
-        from agents.rsl_rl import train as rsl_ppo
-
-        few = ("num_envs=2", "iterations=2", "ppo.rollout_steps=4", "ppo.minibatches=1", "ppo.epochs=1")
-        rsl_ppo.main(["configs/rsl_rl/reach_rsl.yaml", *QUICK, *few, "--out", str(folder), "--device", device])
-    else:
-        train.main([*SB3[kind], *QUICK, "--out", str(folder), "--device", device])
-
-
-@pytest.mark.parametrize("kind", ["rsl", *SB3])
-def test_what_was_trained_plays_as_it_did(kind, device, tmp_path, capsys):
-    run_of(kind, tmp_path / "run", device)
-    play.main([str(tmp_path / "run"), "--device", device, "--out", str(tmp_path / "run" / "evaluation.json")])
-    then, now = (json.loads((tmp_path / "run" / name).read_text()) for name in ("results.json", "evaluation.json"))
-    (trained,) = (row for row in then["results"] if row["case"] == "trained")
-    assert now["results"] == [trained], "the same episodes, the same actions"
-    untrained = next(row for row in then["results"] if row["case"] == "zero")
-    assert trained["return_mean"] != untrained["return_mean"]
-    scores.main([str(tmp_path / "run")])  # takes it for an evaluation of this run
-
-
-def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):
+def test_settings_win_and_a_film_is_written(run_of, device, tmp_path, capsys):
     pytest.importorskip("pyvista", reason="needs the extra render")
-    run_of("ppo", tmp_path / "run", device)
     film = tmp_path / "film.gif"
     small = ("env.render.width=64", "render.height=64")
-    line = [str(tmp_path / "run"), "episode_seconds=0.1", *small, "--film", str(film)]
+    line = [str(run_of("ppo")), "episode_seconds=0.1", *small, "--film", str(film)]
     capsys.readouterr()
     play.main([*line, "--device", device])
     assert "trained" not in capsys.readouterr().out, "a film alone plays no other episodes"
@@ -68,10 +36,45 @@ def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):
     assert "trained" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", ["rsl", "ppo"])
-def test_it_plays_live_as_it_does_in_an_evaluation(kind, device, tmp_path, capsys, monkeypatch):
+QUICK = ("env.fidelity=tiny", "env.episode_seconds=0.2", "evaluation.episodes=3")
+TRAININGS = {
+    "rsl": (
+        "configs/rsl_rl/reach_rsl.yaml", "num_envs=2", "iterations=2", "ppo.rollout_steps=4", "ppo.minibatches=1",
+        "ppo.epochs=1",
+    ),
+    "ppo": ("configs/sb3/reach_sb3.yaml", "total_steps=16", "num_workers=2", "ppo.rollout_steps=8", "ppo.batch_size=8"),
+    "sac": ("configs/sb3/reach_sac.yaml", "total_steps=16", "num_workers=2", "sac.first_random=4", "sac.batch_size=4"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run_of(device, tmp_path_factory):
+    """Folders of short trainings, one a kind."""
+    root = tmp_path_factory.mktemp("runs")
+
+    def run(kind: str):
+        if kind == "rsl":
+            for needed in ("rsl_rl", "tensordict", "git"):
+                pytest.importorskip(needed, reason="needs the extra rsl")
+            from agents.rsl_rl import train as script
+        else:
+            from agents.sb3 import train as script
+        if not (root / kind).exists():
+            script.main([*TRAININGS[kind], *QUICK, "--out", str(root / kind), "--device", device])
+        return root / kind
+
+    return run
+
+
+@pytest.mark.parametrize("kind", TRAININGS)
+def test_policies_play_as_in_training_in_figures_and_live(kind, run_of, device, tmp_path, capsys, monkeypatch):
+    folder = shutil.copytree(run_of(kind), tmp_path / "run")
+    play.main([str(folder), "--device", device, "--out", str(folder / "evaluation.json")])
+    then, now = (json.loads((folder / name).read_text()) for name in ("results.json", "evaluation.json"))
+    zero, _, trained = then["results"]
+    assert now["results"] == [trained] and trained["return_mean"] != zero["return_mean"]
+    scores.main([str(folder)])  # takes it for an evaluation of this run
     pytest.importorskip("viser", reason="needs the extra live")
-    run_of(kind, tmp_path / "run", device)
     totals = []
 
     def watch_env(env, act, seed, port, begin):
@@ -85,8 +88,8 @@ def test_it_plays_live_as_it_does_in_an_evaluation(kind, device, tmp_path, capsy
         raise KeyboardInterrupt  # ends it as Ctrl-C does: quietly
 
     monkeypatch.setattr("piavatar_envs.watch.watch_env", watch_env)
-    play.main([str(tmp_path / "run"), "--live", "--port", "8500", "--first-seed", "7", "--device", device])
-    run = open_run(tmp_path / "run")
+    play.main([str(folder), "--live", "--port", "8500", "--first-seed", "7", "--device", device])
+    run = open_run(folder)
     task = load_task(run.env_id)
     batch = EpisodeHost(task(load_config(task.Config, run.env)), 1, device)
     (episode,) = play.play("trained", run.make_agent(batch.layout, batch.action_size), batch, 7).episodes
@@ -107,23 +110,22 @@ def test_it_plays_live_as_it_does_in_an_evaluation(kind, device, tmp_path, capsy
         (("joints=[tail]",), r"'tail' is not a joint"),
     ],
 )
-def test_what_cannot_be_played_is_refused(options, words, device, tmp_path, capsys, monkeypatch):
-    run_of("ppo", tmp_path / "run", device)
+def test_what_cannot_be_played_is_refused(options, words, run_of, device, monkeypatch):
+    folder = run_of("ppo")
     for builder in ("EpisodeHost", "EnvFactory"):
         monkeypatch.setattr(play, builder, None)  # nothing is built
     with pytest.raises(SystemExit, match=f"error: .*{words}"):
-        play.main([str(tmp_path / "run"), *options, "--device", device])
+        play.main([str(folder), *options, "--device", device])
 
 
-def test_nothing_is_unpickled(device, tmp_path, capsys):
+def test_nothing_is_unpickled(run_of, device, tmp_path):
     """A file that would run code when it is unpickled is refused, and does not."""
 
     class Trap:
         def __reduce__(self):
             return (np.save, (str(tmp_path / "sprung"), np.zeros(1)))
 
-    run_of("ppo", tmp_path / "run", device)
-    policy = tmp_path / "run" / "policy.zip"
+    policy = shutil.copytree(run_of("ppo"), tmp_path / "run") / "policy.zip"
     with zipfile.ZipFile(policy) as whole:
         members = {name: whole.read(name) for name in whole.namelist()}
     members["policy.pth"] = pickle.dumps(Trap())

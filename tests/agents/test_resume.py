@@ -15,7 +15,7 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents.checkpoint import Checkpoint, as_arrays, as_tensors, random_states, set_random_states
+from agents.checkpoint import Checkpoint
 from agents.files import write_atomically
 from agents.sb3 import train
 from agents.sb3.config import load_training
@@ -43,42 +43,34 @@ def checkpoint_of(config, folder: Path, resume: bool = True, script: str = "sb3.
     return Checkpoint(folder, script, config, "cpu", resume)
 
 
-def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
+def test_a_training_killed_while_it_writes_resumes_bit_for_bit(device, tmp_path):
     path = tmp_path / "short.yaml"
     ppo = TINY["ppo"] | {"learning_rate": 1e-3, "final_learning_rate": 1e-4}
-    settings = {"total_steps": 160, "checkpoint_every": 32, "seed": 5, "ppo": ppo}
-    path.write_text(dump_yaml(load_training(TINY | settings)))
+    path.write_text(
+        dump_yaml(load_training(TINY | {"total_steps": 128, "checkpoint_every": 32, "seed": 5, "ppo": ppo}))
+    )
     command = [str(path), "--device", device, "--out"]
     train.main([*command, str(tmp_path / "whole")])
     parts = tmp_path / "parts"
-    run_killed("sb3.train", "step", 75, *command, str(parts))
-    assert checkpoint_steps(parts) == 64
-    assert not (parts / "policy.zip").exists()
-    # it keeps one at 96 steps, and half of the one at 128
-    run_killed("sb3.train", "write", 5, *command, str(parts), "--resume")
-    assert checkpoint_steps(parts) == 96
+    run_killed(5, *command, str(parts))
+    assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["steps"] == 32
     half = parts / "checkpoint.pt.partial"
-    assert 0 < half.stat().st_size < (parts / "checkpoint.pt").stat().st_size
-    with pytest.raises(SystemExit) as refused:
+    assert 0 < half.stat().st_size < (parts / "checkpoint.pt").stat().st_size and not (parts / "policy.zip").exists()
+    with pytest.raises(SystemExit, match=r"error: .*--resume.*--out"):
         train.main([*command, str(parts)])
-    assert re.match(r"error: .* holds a training already; go on with --resume, .*--out.*delete", str(refused.value))
     time.sleep(1.0)  # TensorBoard orders a run's files by the second in which they were begun
     train.main([*command, str(parts), "--resume"])
     assert not half.exists()
-    assert (parts / "curve.csv").read_text() == (tmp_path / "whole" / "curve.csv").read_text()
-    assert len((parts / "curve.csv").read_text().splitlines()) == 11  # 160 steps of episodes of 15
+    curve = (parts / "curve.csv").read_text()
+    assert curve == (tmp_path / "whole" / "curve.csv").read_text() and len(curve.splitlines()) == 9
     # TensorBoard forgets what was logged after the checkpoint and lost
     events = EventAccumulator(str(parts / "tensorboard")).Reload()
-    assert [event.step for event in events.Scalars("time/fps")] == [32, 64, 96, 128, 160]
+    assert [event.step for event in events.Scalars("time/fps")] == [32, 64, 96, 128]
     events = EventAccumulator(str(tmp_path / "whole" / "tensorboard")).Reload()
     rates = [event.value for event in events.Scalars("train/learning_rate")]  # the last update is not logged
-    np.testing.assert_allclose(rates, np.linspace(1e-3, 1e-4, 6)[1:-1], rtol=1e-5)
+    np.testing.assert_allclose(rates, np.linspace(1e-3, 1e-4, 5)[1:-1], rtol=1e-5)
     whole, resumed = (networks(tmp_path / run / "policy.zip") for run in ("whole", "parts"))
     assert len(whole) > 20 and resumed == whole
-
-
-def checkpoint_steps(folder: Path) -> int:
-    return torch.load(folder / "checkpoint.pt", weights_only=True)["state"]["steps"]
 
 
 @pytest.mark.parametrize(
@@ -87,10 +79,10 @@ def checkpoint_steps(folder: Path) -> int:
     ids=["processes", "vector", "sac"],
 )
 def test_every_way_of_training_goes_on_bit_for_bit(settings, device, tmp_path):
-    config = load_training(TINY | {"total_steps": 192, "checkpoint_every": 40} | settings)
+    config = load_training(TINY | {"total_steps": 128, "checkpoint_every": 40} | settings)
     facts, make = prepare(factory(config)), factory(config)
     states, curves = [], []
-    for name, kills in (("whole", ()), ("parts", (70, 150))):
+    for name, kills in (("whole", ()), ("parts", (70,))):
         if config.vector:
             venv = start_vector(config)
         elif kills:
@@ -139,9 +131,9 @@ def test_a_finished_training_has_nothing_to_do_and_can_be_made_longer(tiny, devi
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"seed": 1}, ["seed=0", "now it is 1", "same settings", "--out"]),
-        ({"ppo": {"learning_rate": 0.5}}, ["ppo.learning_rate=0.0007", "now it is 0.5"]),
-        ({"env": {"fidelity": "tiny", "episode_seconds": 0.4}}, ["env.episode_seconds=0.5", "now it is 0.4"]),
+        ({"seed": 1}, ["seed=0", "1", "--out"]),
+        ({"ppo": {"learning_rate": 0.5}}, ["ppo.learning_rate=0.0007", "0.5"]),
+        ({"env": {"fidelity": "tiny", "episode_seconds": 0.4}}, ["env.episode_seconds=0.5", "0.4"]),
     ],
 )
 def test_another_configuration_is_refused(tiny, change, words, tmp_path):
@@ -220,24 +212,3 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     assert path.read_bytes() == b"old" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
     write_atomically(path, lambda file: file.write(b"new"))
     assert path.read_bytes() == b"new" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
-
-
-def test_all_random_numbers_go_on(tiny, tmp_path):
-    import random
-
-    def draw():
-        return random.random(), np.random.normal(), np.random.randint(2**31), torch.randn(3).tolist()
-
-    array = np.broadcast_to(np.arange(6.0).reshape(2, 3).T, (2, 3, 2))[:, ::-1]  # neither in order nor writable
-    np.random.normal()  # one of a pair is kept for the next call
-    tree = {"a": (np.arange(3), np.float32(2.0)), "b": array}
-    checkpoint_of(tiny, tmp_path).save({"random": random_states(), "tree": tree})
-    first = draw()
-    state = checkpoint_of(tiny, tmp_path).state
-    set_random_states(state["random"])
-    assert draw() == first
-    tree = as_arrays(state["tree"])
-    np.testing.assert_array_equal(tree["a"][0], np.arange(3))
-    np.testing.assert_array_equal(tree["b"], array)
-    assert as_tensors(np.array(3.0)).shape == ()
-    assert tree["a"][1] == 2.0 and isinstance(as_tensors(np.float32(1.0)), float)

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from agents import scores
+from agents import compare, scores
 
 
 def row(case: str, value: float, **more) -> dict:
@@ -174,3 +174,34 @@ def test_other_settings_are_refused(runs):
         scores.scores(other)
     with pytest.raises(ValueError, match="there are no runs"):
         scores.scores({})
+
+
+def test_runs_of_several_seeds_are_compared(tmp_path, capsys):
+    found = [run("sb3.train", "Reach-v0", seed, row("trained", value)) for seed, value in enumerate((4.0, 5.0, 9.0))]
+    for seed, content in enumerate(found):
+        (tmp_path / f"{seed}.json").write_text(json.dumps(content))
+    files = [str(tmp_path / f"{seed}.json") for seed in range(3)]
+    compare.main([*files, "--out", str(tmp_path / "scores.json")])
+    report = json.loads((tmp_path / "scores.json").read_text())
+    assert report["seeds"] == [0, 1, 2] and report["of"] == "sb3.train" and "seed" not in report["config"]
+    zero, random, trained = report["results"]
+    assert [zero["return_mean"], random["return_mean"], trained["return_mean"]] == [3.0, 2.0, 6.0]
+    assert zero["seeds"] is None and trained["seeds"] == 3
+    low, high = trained["return_interval"]
+    assert low < 4.0 and high > 9.0  # three seeds are few
+    assert "trained with 3 seeds" in capsys.readouterr().out
+    other = copy.deepcopy(found[1])
+    other["config"]["ppo"]["epochs"] = 7
+    match = [one | {"results": [{"case": "a against b", "win_rate": 0.5}]} for one in found[:2]]
+    for given, words in (
+        ({"a": found[0], "b": other}, r"b has ppo\.epochs=7"),
+        ({"a": found[0], "b": found[0]}, r"seeds \[0, 0\]"),
+        ({"a": found[0]}, "1 runs"),
+        (dict(zip("ab", match, strict=True)), "match of competing agents"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            compare.summarize(given)
+    (tmp_path / "other.json").write_text("{}")
+    for name in ("nowhere.json", "other.json"):
+        with pytest.raises(SystemExit, match=rf"error: .*{name}"):
+            compare.main([files[0], str(tmp_path / name)])

@@ -11,7 +11,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.checkpoint import Checkpoint
-from agents.config import first_training_seed
 from agents.evaluate import Episode
 from agents.sb3 import matches, ppo, selfplay, train
 from agents.sb3.config import TrainingConfig, load_training
@@ -77,20 +76,6 @@ def always(policy, action: float):
     return policy
 
 
-def test_a_snapshot_is_the_policy_of_its_time(policy, tmp_path):
-    pool = Pool(tmp_path / "pool")
-    for steps in (0, 100):
-        pool.add(always(policy, steps / 200.0), steps)
-    always(policy, 0.9)
-    for steps in (100, 0):
-        pool.load(policy, steps)
-        assert policy.action_net.bias.item() == steps / 200.0
-    # plain tensors: reading one runs no code
-    assert (
-        torch.load(tmp_path / "pool" / "snapshot_100_steps.pt", weights_only=True).keys() == policy.state_dict().keys()
-    )
-
-
 def test_a_pool_goes_on_as_it_was_and_begins_empty(policy, tmp_path):
     pool = Pool(tmp_path / "pool")
     for steps in (0, 100, 1000):
@@ -139,17 +124,6 @@ class Watch(BaseCallback):
         self.drawn.append((self.num_timesteps, venv.opponents.drawn[venv.duels[0]]))
         self.seeds |= {world.env.seed for world in venv.worlds.envs}
         return True
-
-
-def test_snapshots_join_the_pool_between_rollouts_and_play(auction, tmp_path):
-    watch = Watch()
-    _, pool, curve = play(auction, tmp_path, watcher=watch)
-    assert pool.steps == [0, 192, 384, 576]
-    assert {steps for _, steps in watch.drawn} == set(pool.steps)
-    assert all(snapshot < now for now, snapshot in watch.drawn)  # nobody plays before it exists
-    # three slots, four rounds a game: two games and a duel end at a time
-    assert curve.steps == [3 * step for step in range(4, 257, 4) for _ in range(3)]
-    assert watch.seeds == {first_training_seed(3), first_training_seed(3) + 1}
 
 
 def test_what_is_interrupted_goes_on_with_its_pool_as_if_it_had_not_been(auction, tmp_path):

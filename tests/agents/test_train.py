@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents import demo
+from agents import demo, play
 from agents.evaluate import evaluate
 from agents.sb3 import train
 from agents.sb3.config import load_training
@@ -37,29 +38,25 @@ def facts(tiny, device):
     return prepare(factory(tiny))
 
 
-def test_the_saved_policy_is_the_trained_one_and_needs_no_wrapper(tiny, workers, facts, tmp_path):
-    model, curve = train.train(tiny, workers, facts, tmp_path)
-    assert model.num_timesteps == tiny.total_steps
-    # episodes of 15 steps: four ended within 64 steps
-    assert curve.steps == [15, 30, 45, 60]
-    assert len((tmp_path / "curve.csv").read_text().splitlines()) == 5
-    env = factory(tiny)()
-    observation, _ = env.reset(seed=5)
-    loaded = PPO.load(tmp_path / "policy.zip", device="cpu")
+def test_training_repeats_in_workers_and_batches_and_depends_on_its_seed(tiny, workers, facts, tmp_path, device):
+    """The same steps, hence the same networks: bit for bit where torch repeats itself, which it does on a CPU."""
+    venv = start_vector(tiny.model_copy(update={"vector": True}), device)
+    weights, returns = [], []
+    for own, seed in ((workers, 1), (workers, 0), (venv, 0)):
+        model, curve = train.train(tiny.model_copy(update={"seed": seed}), own, facts, tmp_path)
+        assert model.num_timesteps == tiny.total_steps and curve.steps == [15, 30, 45, 60]
+        weights.append(np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()]))
+        returns.append(evaluate("x", policy_agent(model), own, 3, 7, progress=False).returns)
+    venv.close()
+    assert not np.allclose(weights[0], weights[1])
+    np.testing.assert_allclose(*returns[1:], rtol=0.0, atol=0.0 if device == "cpu" else 1e-4)
+    # Adam makes steps of one size of gradients that differ in their last place, however small they are
+    np.testing.assert_allclose(*weights[1:], rtol=0.0, atol=0.0 if device == "cpu" else 1e-3)
+    observation = np.random.default_rng(0).normal(size=facts.layout.size).astype(np.float32)
+    loaded = PPO.load(tmp_path / "policy.zip", device="cpu")  # needs no wrapper
     np.testing.assert_array_equal(
         loaded.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
     )
-    env.close()
-
-
-def test_training_repeats_and_depends_on_its_seed(tiny, workers, facts, tmp_path):
-    weights = []
-    for seed in (0, 0, 1):
-        config = tiny.model_copy(update={"seed": seed})
-        model, _ = train.train(config, workers, facts, tmp_path)
-        weights.append(np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()]))
-    np.testing.assert_array_equal(weights[0], weights[1])
-    assert not np.allclose(weights[0], weights[2])
 
 
 def test_networks_see_only_the_chosen_terms(workers, facts, tmp_path):
@@ -82,22 +79,6 @@ def test_networks_see_only_the_chosen_terms(workers, facts, tmp_path):
     np.testing.assert_array_equal(act(observation[None]), act(changed[None]))
     changed[seen] += 0.5
     assert not np.array_equal(act(observation[None]), act(changed[None]))
-
-
-def test_a_vector_trains_what_workers_train(tiny, workers, facts, tmp_path, device):
-    """The same steps, hence the same networks: bit for bit where torch repeats itself, which it does on a CPU."""
-    venv = start_vector(tiny.model_copy(update={"vector": True}), device)
-    weights = []
-    for own in (workers, venv):
-        model, curve = train.train(tiny, own, facts, tmp_path)
-        assert curve.steps == [15, 30, 45, 60]
-        weights.append(np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()]))
-    agent = policy_agent(model)
-    returns = [evaluate("x", agent, own, 3, 7, progress=False).returns for own in (workers, venv)]
-    venv.close()
-    np.testing.assert_allclose(*returns, rtol=0.0, atol=0.0 if device == "cpu" else 1e-4)
-    # Adam makes steps of one size of gradients that differ in their last place, however small they are
-    np.testing.assert_allclose(*weights, rtol=0.0, atol=0.0 if device == "cpu" else 1e-3)
 
 
 @pytest.mark.parametrize("path", PUBLISHED, ids=lambda path: path.stem)
@@ -151,12 +132,14 @@ def test_the_command_line_trains_and_refuses(tiny, device, tmp_path, capsys):
     assert str(refused.value) == "error: ppo.epoch is no setting of TrainingConfig; did you mean ppo.epochs?"
 
 
-def test_the_demo_leaves_what_it_promises_after_one_that_was_stopped(device, tmp_path, monkeypatch):
+def test_the_demo_replaces_a_stopped_one_and_leaves_policy_film_and_scores(tmp_path, monkeypatch):
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra render")
+    for module in (demo, play):
+        monkeypatch.setattr(module, "start_workers", lambda make, count: DummyVecEnv([make] * count))
     settings = (
-        "env.fidelity=tiny", "env.episode_seconds=0.3", "total_steps=64", "num_workers=2", "ppo.rollout_steps=16",
+        "env.fidelity=tiny", "env.episode_seconds=0.2", "total_steps=64", "num_workers=2", "ppo.rollout_steps=16",
         "ppo.batch_size=16", "evaluation.episodes=2", "env.render.width=64", "env.render.height=64",
     )  # fmt: skip
-    pytest.importorskip("imageio_ffmpeg", reason="needs the extra render")
     options = demo.Options(settings=settings, out=tmp_path, seed=4)
 
     def stopped(*args, **kwargs):
@@ -167,20 +150,17 @@ def test_the_demo_leaves_what_it_promises_after_one_that_was_stopped(device, tmp
         patch.setattr(demo, "train", stopped)
         demo.run(options, Console(quiet=True))
     (tmp_path / "before_after.mp4").write_bytes(b"of an earlier one")
+    trained = demo.train
 
-    def looks(*args, **kwargs):
+    def watched(*args, **kwargs):
         assert not any((tmp_path / name).exists() for name in demo.LATER)
         return trained(*args, **kwargs)
 
-    trained = demo.train
-    monkeypatch.setattr(demo, "train", looks)
+    monkeypatch.setattr(demo, "train", watched)
     outcome = demo.run(options, Console(quiet=True))
-    assert [e.agent for e in outcome.evaluations] == ["zero", "random", "scripted IK", "trained"]
     assert len({tuple(e.seed for e in evaluation.episodes) for evaluation in outcome.evaluations}) == 1
-    for name in ("policy.zip", "curve.png", "before_after.mp4", "config.yaml", "results.json"):
-        assert (tmp_path / name).stat().st_size > 0, name
+    for name in ("policy.zip", "curve.png", "before_after.mp4", "config.yaml"):
+        assert (tmp_path / name).stat().st_size > 100, name
     results = json.loads((tmp_path / "results.json").read_text())
-    assert results["benchmark"] == "demo"
-    assert {"commit", "device", "versions", "date", "results", "train_steps_per_s", "total_s"} <= set(results)
     assert [row["case"] for row in results["results"]] == ["zero", "random", "scripted IK", "trained"]
     assert load_training(tmp_path / "config.yaml").seed == 4
