@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -150,25 +149,6 @@ def test_a_straight_right_scores(make_game):
     assert sum(hits) > log[-1][4]["agent_1"]["score"]
     game.reset()
     assert not game.batch.task.score.numpy().any() and not game.batch.task.peak.numpy().any()
-
-
-def test_a_bout_is_taken_up_again_in_mid_blow(make_game, same):
-    game, other = (make_game(BOXING, twin=n, **SOFT) for n in (0, 1))
-    game.reset(seed=0)
-    impulses = [row[4]["agent_0"]["given_impulse"] for row in strike(game)]
-    # a moment in touch, and still in touch a step later: another blow, if the first were forgotten
-    full = 2.0 * SOFT["blow_impulse"]
-    moment = next(k for k, two in enumerate(pairwise(impulses)) if min(two) > full)
-    game.reset(seed=0)
-    strike(game, moment + 1)
-    state = game.get_state()
-    wanted = strike(game, 10)
-    assert wanted[0][4]["agent_0"]["given_impulse"] > full
-    assert wanted[0][4]["agent_0"]["reward_terms"]["hit"] < 0.4, "the head has been counted"
-    other.reset(seed=5)
-    for target in (other, game):
-        target.set_state(state)
-        assert same(strike(target, 10), wanted)
 
 
 @pytest.mark.parametrize(

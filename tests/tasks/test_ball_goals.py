@@ -9,9 +9,9 @@ import warp as wp
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.envs.episodes import Episodes, Outcome
+from piavatar_envs.envs.episodes import Episodes
 from piavatar_envs.tasks import load_task
-from piavatar_envs.tasks.common.ball_goal import Course, Gate, closest_pass, draw_gate, judge_ball, passes
+from piavatar_envs.tasks.common.ball_goal import Course, Gate, closest_pass, draw_gate, passes
 from piavatar_envs.tasks.header import HEAD_RADIUS, TOUCH_HEIGHT
 from tests.tasks.measured import joints, middle, pelvis, prop_motion, prop_particles, seen, still, tolerance
 
@@ -148,14 +148,14 @@ def test_gates_are_drawn_before_the_ball_and_spread(device):
 
 
 class Shot:
-    """A judge and its memory in NumPy, for one environment."""
+    """A shot's best approach and promise in NumPy, of a ball that does not reach the gate."""
 
-    def __init__(self, gate: Gate, center, forward, length: float, start) -> None:
-        self.gate, self.center, self.forward, self.length, self.last = gate, center, forward, length, start
-        self.best, self.through = None, False
+    def __init__(self, gate: Gate, center, start) -> None:
+        self.gate, self.center, self.best = gate, center, None
+        self.length = np.linalg.norm((center - start)[:2])
 
-    def step(self, x, v, gap: float, action) -> tuple[list[float], bool]:
-        """Return the reward terms of a step, and whether the ball has been through."""
+    def step(self, x, v, gap: float, action) -> list[float]:
+        """Return the reward terms of a step."""
         gate, near = self.gate, tolerance(gap, 0.0, 0.4)
         way, flat = self.center - x, np.array([v[0], v[1], 0.0])
         t = np.clip(way @ flat / max(flat @ flat, 1e-6), 0.0, 1.0)
@@ -163,62 +163,9 @@ class Shot:
         miss = np.linalg.norm([*(way - t * flat)[:2], self.center[2] - height])
         promise = 1.0 - np.clip((miss - 0.5 * gate.target_radius) / (self.length - 0.5 * gate.target_radius), 0.0, 1.0)
         best = self.best or (near, promise)
-        earned = [0.1 * max(near - best[0], 0.0), 0.4 * max(promise - best[1], 0.0), 0.0]
         self.best = (max(near, best[0]), max(promise, best[1]))
-        s = [(p - self.center) @ self.forward for p in (self.last, x)]
-        if s[0] < 0.0 <= s[1]:
-            cross = self.last + s[0] / (s[0] - s[1]) * (x - self.last)
-            inside = np.linalg.norm(cross - self.center) <= gate.target_radius
-            earned[2] = 0.5 if inside and not self.through else 0.0
-            self.through = self.through or inside
-        self.last = x
-        return [*earned, -gate.control_cost * np.mean(np.clip(action, -1.0, 1.0) ** 2)], self.through
-
-
-def test_a_shot_earns_what_numpy_says(device):
-    """Balls of random ways, some of them through the gate, judged step by step; an episode earns at most one."""
-    rng, n, steps = np.random.default_rng(3), 12, 25
-    gate, course = gate_struct(), empty_course(n, device)
-    angles = rng.uniform(-0.4, 0.4, n)
-    start = np.tile([0.0, -0.4, 0.11], (n, 1))
-    forward = np.stack([heading(a) for a in angles])
-    center = start + 1.2 * forward + [0.0, 0.0, 0.19]
-    for name, value in (("center", center), ("forward", forward), ("last", start)):
-        getattr(course, name).assign(value.astype(np.float32))
-    course.length.fill_(1.2)
-    course.best.fill_(wp.vec2(-1.0, -1.0))
-    shots = [Shot(gate, center[e], forward[e], 1.2, start[e]) for e in range(n)]
-    speed = rng.uniform(0.5, 5.0, n)
-    v = speed[:, None] * np.stack([heading(a) for a in angles + rng.normal(0.0, 0.2, n)])
-    x, total, ends = start.copy(), np.zeros(n), np.zeros(n, bool)
-    outcome = Outcome()
-    outcome.terms = wp.zeros((n, 1, 4), dtype=float, device=device)
-    outcome.success, outcome.terminated = (wp.zeros((n, 1), dtype=wp.bool, device=device) for _ in range(2))
-    for step in range(steps):
-        if step >= 5:  # struck in the fifth step, and blown about from then on
-            v = v + rng.normal(0.0, 0.3, v.shape)
-            x = x + v / 30.0
-        gap, action = rng.uniform(-0.1, 0.8, n), rng.uniform(-1.5, 1.5, (n, 1, 5))
-        moving = v if step >= 5 else np.zeros_like(v)
-        wp.launch(
-            judge_ball,
-            n,
-            [
-                gate, vectors(x, device), vectors(moving, device),
-                wp.array(gap, dtype=float, device=device), wp.array(action, dtype=float, device=device),
-                course, outcome,
-            ],
-            device=device,
-        )  # fmt: skip
-        for e in range(n):
-            expected, through = shots[e].step(x[e], moving[e], gap[e], action[e, 0])
-            assert outcome.terms.numpy()[e, 0] == pytest.approx(expected, abs=2e-5), f"shot {e}, step {step}"
-            ended = outcome.terminated.numpy()[e, 0]
-            assert bool(outcome.success.numpy()[e, 0]) == bool(ended) == through
-            total[e] += sum(expected[:3])
-            ends[e] |= through
-    assert 2 <= ends.sum() <= n - 2, "the case must see both"
-    assert total.max() <= 1.0 and total[ends].min() > 0.5
+        control = -gate.control_cost * np.mean(np.clip(action, -1.0, 1.0) ** 2)
+        return [0.1 * (self.best[0] - best[0]), 0.4 * (self.best[1] - best[1]), 0.0, control]
 
 
 @pytest.mark.parametrize("task", [KICK, HEADER])
@@ -299,22 +246,21 @@ def test_rewards_metrics_and_observations_are_those_of_numpy(make_env, task):
     env = make_env(task, pose_noise=0.2)
     env.reset(seed=4)
     center, forward = gate_of(env)
-    start, earned = ball(env)[0], []
-    shot, rng = Shot(env.batch.task.gate, center, forward, np.linalg.norm((center - start)[:2]), start), None
+    shot, earned = Shot(env.batch.task.gate, center, ball(env)[0]), []
     rng = np.random.default_rng(1)
     for step in range(16):
         if step == 4 and task == KICK:
-            shot.last = np.array([0.2, -0.3, 0.15])  # nearer to the left foot
-            put_ball(env, shot.last, 2.0 * forward + [-0.3, 0.0, 1.0])
+            # nearer to the left foot
+            put_ball(env, [0.2, -0.3, 0.15], 2.0 * forward + [-0.3, 0.0, 1.0])
         action = rng.uniform(-1.0, 1.0, env.action_space.shape)
         observation, *_, info = env.step(action)
         (x, v), (at, turn) = ball(env), pelvis(env)
         feet = {name: joints(env)[joint_index(name)] for name in FEET}
         parts = feet if task == KICK else {"head": middle(env, "head")}
         reach = env.config.ball_radius + (0.0 if task == KICK else float(HEAD_RADIUS))
-        expected, through = shot.step(x, v, min(np.linalg.norm(part - x) for part in parts.values()) - reach, action)
+        expected = shot.step(x, v, min(np.linalg.norm(part - x) for part in parts.values()) - reach, action)
         assert list(info["reward_terms"].values()) == pytest.approx(expected, abs=2e-4), step
-        assert info["success"] == through
+        assert not info["success"]
         assert info["ball_speed"] == pytest.approx(np.linalg.norm(v), abs=1e-4)
         assert info["distance_to_target"] == pytest.approx(np.linalg.norm(center - x), abs=1e-4)
         assert info["ball_mass"] == pytest.approx(prop_motion(env.batch)[0][0], rel=1e-5)
@@ -393,29 +339,6 @@ def test_the_ball_in_the_gate_ends_the_episode(make_env, aside, through):
     assert env.step(still(env))[4]["reward_terms"]["goal"] == 0.0, "a goal counts once"
     env.reset(seed=1)
     assert not env.step(still(env))[4]["success"], "the next episode begins anew"
-
-
-def test_a_ball_back_through_the_gate_does_not_count(make_env):
-    env = make_env(KICK)
-    env.reset(seed=1)
-    center, forward = gate_of(env)
-    put_ball(env, center + 0.15 * forward, -4.0 * forward)
-    outcomes = [env.step(still(env)) for _ in range(4)]
-    assert (ball(env)[0] - center) @ forward < -0.1, "the case must cross"
-    assert not any(row[2] or row[4]["success"] for row in outcomes)
-
-
-def test_a_ball_falls_freely_until_the_head(make_env):
-    env = make_env(HEADER)
-    env.reset(seed=0)
-    start, v = ball(env)
-    for step in range(1, 8):
-        env.step(still(env))
-        x, now = ball(env)
-        time = step * env.config.physics.control_dt
-        assert now == pytest.approx(v - [0.0, 0.0, GRAVITY * time], abs=1e-3)
-        # a step late by half a substep
-        assert x == pytest.approx(start + v * time - [0.0, 0.0, 0.5 * GRAVITY * time**2], abs=0.02)
 
 
 def test_a_nod_in_time_sends_the_ball_forward(make_batch):

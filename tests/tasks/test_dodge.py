@@ -72,10 +72,11 @@ def test_throws_begin_before_the_avatar_and_lead_to_chest_or_head(make_env):
     place, yaw = (0.5, -0.3), 2.0
     avatar = {"position": list(place), "yaw": yaw}
     env = make_env(DODGE, throw_interval=0.2, pose_noise=0.2, **{"scene.avatars": [avatar]})
-    config, rows = env.config, []
+    config, rows, masses = env.config, [], []
     back = Rotation.from_rotvec([0.0, 0.0, -yaw])
     for seed in range(6):
         observation, _ = env.reset(seed=seed)
+        masses.append(seen(env, observation, "ball_mass"))
         for _ in range(60):
             due = np.flatnonzero(seen(env, observation, "time_to_throw") == 0.0)
             at = joints(env)
@@ -98,6 +99,8 @@ def test_throws_begin_before_the_avatar_and_lead_to_chest_or_head(make_env):
         slack = 0.05 * (high - low)
         assert low - slack < values.min() < low + 4.0 * slack and high - 4.0 * slack < values.max() < high + slack
     assert 0.5 * config.aim_spread < rows[:, 4].max() < np.sqrt(3.0) * config.aim_spread
+    low, high = config.ball_mass
+    assert low <= np.min(masses) < np.max(masses) <= high + 1e-4 and np.ptp(masses) > 0.5 * (high - low)
     # numbers of a throw do not come from one another
     correlation = np.corrcoef(rows[:, :4].T) - np.eye(4)
     assert np.abs(correlation).max() < 4.0 / np.sqrt(len(rows))
@@ -121,14 +124,6 @@ def test_a_thrown_ball_flies_freely_and_keeps_its_mass(make_env):
             # a substep's gravity acts before its motion
             assert at == pytest.approx(start + velocity * time + 0.5 * GRAVITY * time**2, abs=0.01)
         assert np.array_equal(mass, env.batch.simulation.model.particles.mass.numpy())
-
-
-def test_masses_are_spread_and_drawn_for_each_ball(make_env):
-    env = make_env(DODGE, num_balls=2)
-    masses = np.array([seen(env, env.reset(seed=seed)[0], "ball_mass") for seed in range(80)])
-    low, high = env.config.ball_mass
-    assert low <= masses.min() < low + 0.1 and high - 0.1 < masses.max() <= high + 1e-4
-    assert np.abs(np.corrcoef(masses.T)[0, 1]) < 4.0 / np.sqrt(len(masses))
 
 
 @wp.kernel
@@ -204,36 +199,11 @@ def test_a_ball_is_thrown_when_due_caught_beyond_the_radius_and_else_left_alone(
     assert all(np.isnan(array[:, 0]).all() for array in (position, velocity, spin))  # the other ball's
 
 
-def test_a_ball_that_has_flown_past_is_caught_and_waits(make_env):
-    """It lies behind the avatar until its turn, and never comes back from a wall."""
-    env = make_env(DODGE, throw_speed=[7.0, 8.0], throw_interval=1.0, **WIDE)
-    waiting, radius = waiting_places((0.0, 0.0, 0.0), env.config), catching_distance(env.config)
-    caught = 0
-    for seed in range(3):
-        env.reset(seed=seed)
-        was = [tracked(env, index) for index in range(2)]
-        for index in range(2):
-            assert was[index][0] == pytest.approx(waiting[index], abs=1e-3) and was[index][0][1] > 1.0
-        for _ in range(60):
-            env.step(still(env))
-            for index in range(2):
-                at, velocity = tracked(env, index)
-                jumped = np.linalg.norm(at - was[index][0]) > 0.5
-                if jumped and np.linalg.norm(at - waiting[index]) < 0.05:
-                    caught += 1
-                    distance = np.hypot(*was[index][0][:2])
-                    assert distance > radius and was[index][0][:2] @ was[index][1][:2] > 0.0
-                    assert np.linalg.norm(velocity) < 0.4
-                out = at[:2] / np.hypot(*at[:2])
-                if np.hypot(*at[:2]) > radius:
-                    assert velocity[:2] @ out > -0.2 or velocity[:2] @ spawn(env, index)[1][:2] > 0.0
-                was[index] = at, velocity
-    assert caught >= 2
-
-
 def test_waiting_balls_do_not_disturb(make_env):
     env = make_env(DODGE, throw_interval=60.0, pose_noise=0.0)
     env.reset(seed=0)
+    for index, place in enumerate(waiting_places((0.0, 0.0, 0.0), env.config)):
+        assert tracked(env, index)[0] == pytest.approx(place, abs=1e-3) and place[1] > 1.0
     for _ in range(10):
         info = env.step(still(env))[4]
         assert info["impulse"] == 0.0 and info["hits"] == 0.0 and info["success"] and info["cost"] == 0.0
