@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 from functools import partial
@@ -60,19 +59,6 @@ def test_committed_results_stay_small():
         pytest.skip("not a git checkout")
     sizes = {name: (ROOT / name).stat().st_size for name in listed.stdout.split("\0") if (ROOT / name).is_file()}
     assert sum(sizes.values()) < 8e6 and [name for name, size in sizes.items() if size > 1e6] == []
-
-
-def test_walking_speed_of_the_guide_is_that_of_the_results():
-    """Compare with the mean distance of a steady walk: ``v dt (N + 1) / 2`` over ``N`` steps."""
-    speeds = []
-    for path in sorted((ROOT / "benchmarks" / "results" / "ppo").glob("walk_*/evaluation.json")):
-        run = json.loads(path.read_text(encoding="utf-8"))
-        env, dt = run["env"], run["env"]["physics"]["control_dt"]
-        (row,) = run["results"]
-        assert row["success_at_end"] == 1.0 and row["mean_steps"] == env["episode_seconds"] / dt
-        speeds.append(2.0 * row["mean_distance_m"] / (dt * (row["mean_steps"] + 1.0)))
-    guide = PAGES["docs/training.md"].read_text(encoding="utf-8")
-    assert len(speeds) == 5 and f"{min(speeds):.2f} to {max(speeds):.2f} m/s from the first step on" in guide
 
 
 def test_replacements_occur_in_the_pages():

@@ -118,36 +118,33 @@ def bits(yes: np.ndarray) -> np.ndarray:
     return np.repeat(masks, 32)[: len(yes)].astype(np.uint32).view(np.int32)
 
 
-@pytest.fixture(scope="module", params=[BLOCK, 2 * BLOCK, BLOCK + 50])
-def values(request) -> np.ndarray:
-    return np.random.default_rng(request.param).integers(-3, 4, request.param).astype(np.int32)
+def equal_lanes(values: np.ndarray) -> np.ndarray:
+    expected = np.zeros(len(values), np.int32)
+    for value in np.unique(values):
+        expected[values == value] = bits(values == value)[values == value]
+    return expected
+
+
+#: Intrinsics, and what they return by the programming guide.
+EXPECTED = {
+    1: lambda values: bits(values > 0),
+    2: lambda values: np.where(values > 0, bits(values > 0), bits(values <= 0)),
+    3: equal_lanes,
+    4: lambda values: [values[t // 32 * 32 :][:32].max() - values[t // 32 * 32 + 7] for t in range(len(values))],
+}
+
+
+@pytest.mark.parametrize("count", [BLOCK, 2 * BLOCK, BLOCK + 50])
+@pytest.mark.parametrize("question", EXPECTED)
+def test_lanes_of_a_warp_exchange_values(answers, question, count):
+    values = np.random.default_rng(count).integers(-3, 4, count).astype(np.int32)
+    np.testing.assert_array_equal(answers(question, values), EXPECTED[question](values))
 
 
 def test_shared_memory_and_shuffles(answers):
     values = np.arange(2 * BLOCK, dtype=np.int32) % 7
     sums = values.reshape(2, BLOCK).sum(1) + [0, 1000]
     np.testing.assert_array_equal(answers(0, values), np.repeat(sums, BLOCK))
-
-
-def test_ballots(answers, values):
-    np.testing.assert_array_equal(answers(1, values), bits(values > 0))
-
-
-def test_lanes_of_another_branch_are_not_active(answers, values):
-    expected = np.where(values > 0, bits(values > 0), bits(values <= 0))
-    np.testing.assert_array_equal(answers(2, values), expected)
-
-
-def test_matches(answers, values):
-    expected = np.zeros(len(values), np.int32)
-    for value in np.unique(values):
-        expected[values == value] = bits(values == value)[values == value]
-    np.testing.assert_array_equal(answers(3, values), expected)
-
-
-def test_reductions_are_over_the_active_lanes(answers, values):
-    expected = [values[t // 32 * 32 :][:32].max() - values[t // 32 * 32 + 7] for t in range(len(values))]
-    np.testing.assert_array_equal(answers(4, values), expected)
 
 
 @wp.func_native(

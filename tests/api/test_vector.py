@@ -142,15 +142,6 @@ def test_seeds_count_up_and_lists_are_taken_as_they_are(make_vec, equal):
     assert equal(mixed, np.stack([following[0], by_number[1], following[2]]))
 
 
-def test_vectors_without_a_seed_differ(device):
-    starts = []
-    for _ in range(2):
-        vector = AvatarVectorEnv("Reach-v0", 2, device=device, fidelity="tiny")
-        starts += list(vector.reset()[0])
-        vector.close()
-    assert all(np.abs(a - b).max() > 1e-4 for i, a in enumerate(starts) for b in starts[:i])
-
-
 MASK = np.array([True, False, False])
 
 
@@ -467,16 +458,6 @@ def test_a_bad_state_is_refused_and_changes_nothing(make_vec, spoil):
     with pytest.raises(ValueError, match="state"):
         vector.set_state(spoil(state))
     assert bytes_of(vector.get_state()) == before
-
-
-def test_a_closed_vector_goes_on(device, equal):
-    vector = AvatarVectorEnv("Reach-v0", 2, device=device, fidelity="tiny", num_threads=2)
-    action = actions_of(vector, 1)[0]
-    vector.reset(seed=0)
-    before = [vector.step(action)[0] for _ in range(3)]
-    vector.close()
-    vector.reset(seed=0)
-    assert all(equal(vector.step(action)[0], one) for one in before)
 
 
 # pictures and wrappers

@@ -18,6 +18,7 @@ VARIED |= {f"{name}_factor": (0.6, 1.5) for name in ("mass", "stiffness", "groun
 CASES = [pytest.param(name, VARIED, id=name) for name in task_modules()]
 CASES += [pytest.param(name, {}, id=f"{name}-fixed") for name in SAMPLE]
 CASES += [pytest.param(name, VARIED | {"shape.pool": 3}, id=f"{name}-pool") for name in SAMPLE]
+CASES += [pytest.param("PIAvatar/Reach-v0", VARIED | {"control": "torque"}, id="torque")]
 
 
 def batch_step(batch, actions) -> dict[str, np.ndarray]:

@@ -53,30 +53,6 @@ def test_every_task_passes_the_checker_and_repeats_and_restores_a_run(make_env, 
     assert alike(equal, last, run(env, rows[6:]))
 
 
-def test_environment_i_is_the_single_one_and_a_masked_reset_spares_the_others(make_env, make_batch, control, equal):
-    settings = {"control": control, "shape.randomize": True, "mass_factor": (0.7, 1.4)}
-    batch, single = make_batch(REACH, 3, **settings), make_env(REACH, **settings)
-    rows = np.stack([actions(single, 8, seed) for seed in range(3)], axis=1)
-    batch.reset(seeds=[5, 6, 7])
-    seen = []
-    for step, row in enumerate(rows):
-        if step == 5:
-            before = batch.get_state()
-            batch.reset(env_mask=np.array([False, True, False]))
-            after = batch.get_state()
-            spared = [before[name][[0, 2]].tobytes() == after[name][[0, 2]].tobytes() for name in before]
-            assert all(spared)
-            assert not after["controller_0.velocity"][1].any() and before["controller_0.velocity"][1].any()
-        batch.action.assign(row[:, None])
-        batch.step()
-        seen.append(batch.observation.numpy()[:, 0].copy())
-    for i in (0, 2):
-        single.reset(seed=5 + i)
-        for step in range(len(rows)):
-            assert equal(single.step(rows[step, i])[0], seen[step][i])
-    batch.action.zero_()
-
-
 def test_a_failure_freezes_the_environment(make_env, control):
     env = make_env(REACH, control=control)
     env.reset(seed=0)

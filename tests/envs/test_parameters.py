@@ -7,7 +7,6 @@ import pytest
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.envs.parameters import ASSIST, PARAMETERS
-from piavatar_envs.sim.randomize import Parameter
 from tests.sim.randomized import VARIED, by_name, check_term, factors_of
 
 REACH = "PIAvatar/Reach-v0"
@@ -60,14 +59,6 @@ def test_root_assistance_is_observed_as_it_is_now(make_batch, control):
     assert by_name(batch)[name] == pytest.approx(1.0)
     batch.set_state(state)
     assert by_name(batch)[name] == pytest.approx(shares, abs=1e-6)
-    assert name not in by_name_of_poses(make_batch)
-
-
-def by_name_of_poses(make_batch) -> dict[str, np.ndarray]:
-    """Return the parameters where a wrench holds the root."""
-    batch = make_batch(REACH, 3, observe_parameters=True, **VARIED)
-    batch.reset(seeds=[1, 2, 3])
-    return by_name(batch)
 
 
 def test_masses_of_props_are_observed(observed):
@@ -144,9 +135,3 @@ def test_named_shape_parameters_and_points_are_no_parameters(make_batch):
     assert {(p.low, p.high) for p in batch.layout[PARAMETERS].parameters if p.name.startswith("shape_")} == {
         (-0.5, 0.5)
     }
-
-
-def test_parameters_are_scaled_to_their_values():
-    linear, log = Parameter("a", "m", 1.0, 3.0, "a"), Parameter("b", "kg", 0.1, 10.0, "b", log=True)
-    assert linear.value(np.array([-1.0, 0.0, 0.5, 1.0])) == pytest.approx([1.0, 2.0, 2.5, 3.0])
-    assert log.value(np.array([-1.0, 0.0, 0.5, 1.0])) == pytest.approx([0.1, 1.0, 10.0**0.5, 10.0])

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import Annotated, Literal
 
 import numpy as np
 import pytest
-from pydantic import BaseModel, Field
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
-from piavatar_envs.config import FROZEN, ControlConfig, EnvConfig, PoseControlConfig
+from piavatar_envs.config import EnvConfig
 from piavatar_envs.config.load import setting_keys
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
 from piavatar_envs.envs.task import Metric, Task, Term
@@ -22,7 +20,6 @@ from piavatar_envs.mpm.types import FAILURE_NAMES
 from scripts import env_pages
 from scripts.pages.entries import Entry, Facts, entries, gather
 from scripts.pages.gaps import gaps
-from scripts.pages.settings import sections_of
 from scripts.pages.text import FAILURE_DOCS, entry_page
 
 ENTRIES = {entry.name: entry for entry in entries()}
@@ -99,28 +96,7 @@ def test_usage_runs(page, device):
     assert "info" in names or "infos" in names
 
 
-class Tuned(BaseModel):
-    model_config = FROZEN
-    gain: float = Field(2.0, gt=0.0, lt=9.0, description="a gain [1/s]")
-
-
-class Item(BaseModel):
-    model_config = FROZEN
-    name: str = Field(..., description="its name")
-    at: tuple[float, float, float] = Field((0.0, 1.0, 0.5), description="where [m]")
-
-
-class MadeUpConfig(EnvConfig):
-    control: ControlConfig = Field(PoseControlConfig(root="free"), description="how poses move the body")
-    tuned: Tuned = Field(Tuned(gain=3.0), description="a section of the task")
-    items: tuple[Item, ...] = Field((Item(name="ball"), Item(name="box", at=(0, 0, 2))), description="things")
-    count: int | None = Field(None, ge=1, description="how many")
-    kind: Literal["a", "b"] | None = Field("a", description="of what kind")
-    shares: dict[str, Annotated[float, Field(ge=0.0, le=1.0)]] = Field({}, description="share of each [-]")
-
-
 class MadeUp(Task):
-    Config = MadeUpConfig
     description = "made up"
     summary = "A task that is made up."
     rewards = (Term("near", "of being near"),)
@@ -129,27 +105,9 @@ class MadeUp(Task):
     success_doc = "it is near"
 
 
-def test_settings_have_default_range_and_unit():
-    # entries of lists are named without their section, and come late
-    listed = {row.key: row for section in reversed(sections_of(MadeUpConfig())) for row in section.settings}
-    expected = {
-        "tuned.gain": ("`3`", "1/s", "(0, 9)", True),
-        "control.root": ('`"free"`', "", '`"wrench"`, `"free"`', True),
-        "control.tone": ("`1`", "-", "[0, 1]", False),
-        "physics.num_substeps": ("`None`", "", "integer [1, 10000] or `None`", False),
-        "items": ('`[{name: "ball"}, {name: "box", at: [0, 0, 2]}]`', "", "list of entries, see below", True),
-        "at": ("`[0, 1, 0.5]`", "m", "3 numbers", False),
-        "name": ("required", "", "text", False),
-        "kind": ('`"a"`', "", '`"a"`, `"b"` or `None`', True),
-        "shares": ("`{}`", "-", "mapping to numbers [0, 1]", True),
-    }
-    for key, row in expected.items():
-        assert (listed[key].default, listed[key].unit, listed[key].allowed, listed[key].own) == row, key
-
-
 def test_gaps_in_the_documentation_are_found():
     layout = ObservationLayout([ObservationTerm("height", 1, "m", "world", "of the pelvis")])
-    facts = Facts(MadeUp(MadeUpConfig()), layout, (), {"success": False}, {"distance": 1.0, "cost": 0.0})
+    facts = Facts(MadeUp(EnvConfig()), layout, (), {"success": False}, {"distance": 1.0, "cost": 0.0})
 
     def found(facts=facts, **attributes):
         return "\n".join(gaps(Entry("made_up", "MadeUp-v0", type("MadeUp", (MadeUp,), attributes)), facts))
