@@ -37,7 +37,7 @@ class Options(runner.Options):
     """Options of the fingerprint."""
 
     #: ids and names of games; all of them if not given
-    worlds: tuple[str, ...] = ()
+    envs: tuple[str, ...] = ()
     #: control modes
     control: tuple[str, ...] = ("pose", "pd", "torque")
     #: resolutions of the bodies
@@ -49,14 +49,14 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Yield a row for each world, control mode and resolution; refused combinations say why."""
+    """Yield a row for each environment, control mode and resolution; refused combinations say why."""
     games = listed_games() if options.num_envs == 1 else ()
-    worlds = options.worlds or (*task_modules(), *games)
-    every = [(w, c, f) for f in options.fidelity for w in worlds for c in options.control]
-    for world, control, fidelity in runner.progress(every, "baseline"):
-        row = {"case": f"{world} {control} {fidelity}", "num_envs": options.num_envs}
+    names = options.envs or (*task_modules(), *games)
+    every = [(n, c, f) for f in options.fidelity for n in names for c in options.control]
+    for name, control, fidelity in runner.progress(every, "baseline"):
+        row = {"case": f"{name} {control} {fidelity}", "num_envs": options.num_envs}
         try:
-            env = _make(world, options, control=control, fidelity=fidelity)
+            env = _make(name, options, control=control, fidelity=fidelity)
         except ValueError as error:  # a task may not support a control mode
             yield row | {"refused": f"{type(error).__name__}: {error}"}
             continue
@@ -66,12 +66,12 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
             env.close()
 
 
-def _make(world: str, options: Options, **settings: Any) -> Any:
-    if "/" not in world:
-        return load_game(world).parallel_env(device=options.device, **settings)
+def _make(name: str, options: Options, **settings: Any) -> Any:
+    if "/" not in name:
+        return load_game(name).parallel_env(device=options.device, **settings)
     if options.num_envs == 1:
-        return gym.make(world, device=options.device, disable_env_checker=True, **settings).unwrapped
-    return gym.make_vec(world, num_envs=options.num_envs, device=options.device, **settings).unwrapped
+        return gym.make(name, device=options.device, disable_env_checker=True, **settings).unwrapped
+    return gym.make_vec(name, num_envs=options.num_envs, device=options.device, **settings).unwrapped
 
 
 def fingerprint(env: Any, steps: int) -> dict[str, Any]:
