@@ -35,7 +35,7 @@ class Scorer:
         self.failure = 0
 
     def count(self, touches: dict[tuple[int, str, int], tuple[float, float, float]]) -> np.ndarray:
-        """Points ``(agents, agents)`` for impulses [N s] by (agent, its body part, by whom)."""
+        """Points ``(agents, agents)`` for impulses [N s] by (agent, its body part, other agent)."""
         part_impulse = np.zeros((1, self.agents * len(PARTS), self.agents, 3), np.float32)
         for (agent, part, by), impulse in touches.items():
             part_impulse[0, agent * len(PARTS) + PARTS.index(part), by] = impulse

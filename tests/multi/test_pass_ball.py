@@ -165,8 +165,8 @@ def test_observed_is_where_the_ball_shall_go(circle):
 STANDING = ((0.0, 1.0, 1.0), (-1.0, 0.0, 1.0), (1.0, 0.0, 1.0))
 
 
-#: The first of them has kicked it: where the ball is, who touches it, and then whose turn it is, whether it has
-#: touched it, the passes, and how often the first two have touched it.
+#: The first agent has kicked the ball: its place and the agents that touch it; then the agent whose turn it is, whether
+#: it has touched the ball, the passes, and the touches of the first two agents.
 KICKED = ((0.0, 0.8), (0,), (0, 1, 0, 1, 0))
 
 

@@ -39,7 +39,7 @@ def tracked(env, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spawn(env, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where and how fast a ball was placed last."""
+    """Position [m] and velocity [m/s] with which a ball was placed last."""
     spawn = env.batch.simulation.props.initial
     return spawn.position.numpy()[0, index].astype(float), spawn.velocity.numpy()[0, index].astype(float)
 

@@ -28,7 +28,7 @@ def worth_of(env, turns: np.ndarray) -> float:
 
 
 def faces(env) -> np.ndarray:
-    """Where the pelvis faces, a unit vector."""
+    """Direction that the pelvis faces, a unit vector."""
     return pelvis(env)[1].apply([0.0, -1.0, 0.0])
 
 
