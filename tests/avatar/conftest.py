@@ -1,4 +1,4 @@
-"""A rig: one avatar in empty space or on a floor, driven step by step, and read back in NumPy."""
+"""A rig: one avatar in empty space or on a floor, stepped by the pose controller and read back in NumPy."""
 
 from __future__ import annotations
 
@@ -176,11 +176,11 @@ class Rig:
 
     def everything(self) -> dict[str, np.ndarray]:
         """Return all that a checkpoint would hold, and the tracked pose."""
-        drive, tracked = (
+        command, tracked = (
             {field.name: getattr(group, field.name).numpy().copy() for field in fields(group)}
             for group in (self.avatar.state, self.avatar.tracked)
         )
-        return {**self.state.numpy(), **drive, **tracked}
+        return {**self.state.numpy(), **command, **tracked}
 
     def totals(self, about=(0.0, 0.0, 0.0), env: int = 0) -> Totals:
         return totals(self.model, self.state, env, about=about)
@@ -244,15 +244,15 @@ def build_rig(
     floor: bool = False,
     decoupling: str = "split",
     num_substeps: int | None = None,
-    room: float = 1.3,
+    half_width: float = 1.3,
     others: int = 0,
     colliders: Sequence[Collider] = (),
     **settings,
 ) -> Rig:
     """Build a standing avatar ``cells`` grid spacings tall.
 
-    ``shapes`` are shape parameters by name, one set an environment; ``room`` is the half width of the domain [m]; so
-    many ``others`` are particles that come before the avatar's, in a row in the domain's corner. ``colliders`` follow
+    ``shapes`` are shape parameters by name, one set an environment; ``half_width`` is that of the domain [m];
+    ``others`` is the number of particles before the avatar's, in a row in the domain's corner. ``colliders`` follow
     the ``floor``.
     """
     asset = load_asset()
@@ -267,7 +267,9 @@ def build_rig(
         joints = np.stack([body.joints for body in bodies])
     model = build_model(
         MaterialPoints.uniform(np.pad(volume, ((0, 0), (others, 0)), mode="mean"), DENSITY),
-        make_grid((-room, -room, 0.0 if floor else -room), (room, room, 1.2 + room), dx),
+        make_grid(
+            (-half_width, -half_width, 0.0 if floor else -half_width), (half_width, half_width, 1.2 + half_width), dx
+        ),
         num_envs=num_envs,
         device=device,
         gravity=(0.0, 0.0, -gravity),
@@ -277,7 +279,7 @@ def build_rig(
     )
     state, scratch = allocate(model)
     x = state.x.numpy()
-    x[:, :others] = [0.7 * room, 0.7 * room, 0.5] + np.linspace(0.0, 0.2, others)[:, None] * [0.0, 0.0, 1.0]
+    x[:, :others] = [0.7 * half_width, 0.7 * half_width, 0.5] + np.linspace(0.0, 0.2, others)[:, None] * [0.0, 0.0, 1.0]
     state.x.assign(x)
     velocity_lag = np.zeros((1, volume.shape[1]), np.float32)
     mass = volume * np.float32(DENSITY)

@@ -90,7 +90,7 @@ class Lying:
 @pytest.fixture
 def lying(make_rig, wild_pose):
     def build(seed: int, height: float, solid: bool = True, highest: bool = False, colliders=()) -> Lying:
-        rig = make_rig(cells=16, floor=True, colliders=colliders, room=2.0)
+        rig = make_rig(cells=16, floor=True, colliders=colliders, half_width=2.0)
         bones = np.flatnonzero(rig.points.bone >= 0)
         made = Joints(rig, solid=solid)
         pose = wild_pose(np.random.default_rng(seed))
@@ -284,7 +284,7 @@ def test_no_bone_is_skipped_of_which_a_point_is_too_fast(make_rig, wild_pose, de
         for kind, size in sizes.items()
         for _ in range(2)
     ]
-    rig = make_rig(cells=16, floor=True, colliders=solids, room=2.0, num_envs=n)
+    rig = make_rig(cells=16, floor=True, colliders=solids, half_width=2.0, num_envs=n)
     made = Joints(rig, solid=True).pose(wild_pose(rng))
     body, workspace, boundaries = made.body, made.body._workspace, rig.model.boundaries
     ground = body._ground(rig.scratch)

@@ -165,7 +165,7 @@ def test_commanded_motion_of_a_free_body_carries_no_momentum(make_rig):
 
 def test_moving_limbs_do_not_disturb_a_flying_body(make_rig):
     # Contact-carried targets: without the motion G the shape is 50 mm off at 4 m/s, with it nothing.
-    rig = make_rig(root="free", free_motion=True, room=1.9)
+    rig = make_rig(root="free", free_motion=True, half_width=1.9)
     rig.set_rigid_velocity((0.0, -4.0, 0.0), (0.0, 0.0, 0.0))
     for k in range(1, 9):
         rig.command(gesture(k))

@@ -119,7 +119,7 @@ def test_threads_that_have_several_particles_move_them_as_one_each_does(
     if not gpu.is_cuda:
         pytest.skip("on a CPU one thread has all particles")
 
-    def driven():
+    def moved():
         rng = np.random.default_rng(8)
         rig = make_rig(cells=16, num_envs=3, gravity=9.81, floor=True, others=37)
         u, x = rig.state.u.numpy(), rig.state.x.numpy()
@@ -130,11 +130,11 @@ def test_threads_that_have_several_particles_move_them_as_one_each_does(
         rig.step(2)
         return rig
 
-    one = driven()
+    one = moved()
     particles = 3 * one.points.num_points
     monkeypatch.setattr(lanes, "RESIDENT", particles // (gpu.sm_count * rounds))
     assert lanes.particle_rounds(device, particles) == rounds
-    several = driven()
+    several = moved()
     assert several.state.failure.numpy().tolist() == [0, FAILURE_NONFINITE, 0]
     found = several.everything()
     for name, value in one.everything().items():

@@ -109,7 +109,7 @@ def test_the_pull_is_given_back_bone_by_bone(make_rig, wild_pose):
 
 
 def test_a_dent_turns_with_the_body(make_rig):
-    # What contact displaced is carried round with the bones, not left pointing where it did.
+    # A displacement by contact turns with the bones.
     rig = make_rig(root="free", alpha=0.0, decoupling="no_stress", num_substeps=12)
     bulge(rig)
     dent = rig.read("x") - rig.target()

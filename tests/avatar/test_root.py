@@ -53,7 +53,7 @@ def test_the_weight_of_every_body_is_its_own(make_rig):
 
 
 def test_a_push_within_the_limits_is_survived(make_rig):
-    rig = make_rig(gravity=G, floor=True, room=1.6)
+    rig = make_rig(gravity=G, floor=True, half_width=1.6)
     log = push(rig, (0.0, 1000.0, 0.0))
     assert 5.0 < log["tilt"].max() < 45.0
     assert not log["released"].any()
@@ -66,7 +66,7 @@ def test_a_push_within_the_limits_is_survived(make_rig):
 
 
 def test_a_push_beyond_the_limits_knocks_down_for_good(make_rig):
-    rig = make_rig(gravity=G, floor=True, room=2.0)
+    rig = make_rig(gravity=G, floor=True, half_width=2.0)
     log = push(rig, (0.0, 1500.0, 0.0), steps=15, after=10)
     assert log["released"].any()
     first = log["released"].argmax()
@@ -92,7 +92,7 @@ def test_a_push_beyond_the_limits_knocks_down_for_good(make_rig):
 )
 def test_the_root_is_released_beyond_each_limit(make_rig, turn, offset, limited):
     # The command is moved off the body at once; only its size decides.
-    rig = make_rig(gravity=0.0, room=1.6)
+    rig = make_rig(gravity=0.0, half_width=1.6)
     for share in (0.9, 1.1):
         rotvec, root = np.zeros((22, 3)), rig.points.joints[0, 0] + share * np.array(offset)
         rotvec[0] = share * np.array(turn)
@@ -107,7 +107,7 @@ def test_the_root_is_released_beyond_each_limit(make_rig, turn, offset, limited)
 @pytest.mark.parametrize("commanded", [False, True])
 def test_a_released_body_falls_freely(make_rig, commanded):
     # Not even by moving its limbs, or by a commanded root, can it push itself off the air.
-    rig = make_rig(gravity=G, room=1.8)
+    rig = make_rig(gravity=G, half_width=1.8)
     rig.avatar.state.released.fill_(1)
     swing = np.zeros((22, 3))
     for k in range(6):

@@ -245,7 +245,7 @@ def test_a_limb_hangs_on_the_torso_by_its_seam(body):
 
 
 def test_hands_feet_and_head_are_no_seam(body):
-    # What touches other parts of the body must be free of it.
+    # Parts that touch other parts of the body must be free of it.
     particles, _, seam = body
     for name in ("left_wrist", "right_wrist", "left_ankle", "right_foot", "left_elbow", "left_knee", "head"):
         assert not seam[particles.skin_joints[:, 0] == joint_index(name)].any(), name

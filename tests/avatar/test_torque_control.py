@@ -70,7 +70,7 @@ def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
 
 @pytest.mark.parametrize("attachment", [None, 200.0])
 def test_particles_go_from_skinned_places_to_skinned_places(make_rig, wild_pose, attachment):
-    # Where a wild pose bends the joints, too: there ``J qdot`` alone, at a particle, is another velocity.
+    # Also where a wild pose bends joints: there ``J qdot`` alone, at a particle, is another velocity.
     rng = np.random.default_rng(2)
     made = Joints(make_rig(cells=16), attachment=attachment).pose(wild_pose(rng))
     velocity = rng.normal(0.0, 3.0, NUM_DOF)

@@ -250,7 +250,7 @@ def test_contact_with_a_moving_surface_follows_coulomb(device, kind):
     stuck = np.linalg.norm(after - surface, axis=1) < 1e-5
     for index, expected in enumerate([(0.0, 0.0), (0.01, 0.2), (0.1, 0.5), (0.95, 1.0)]):
         assert expected[0] <= stuck[hit & (field == index)].mean() <= expected[1], index
-    # friction never drives: the sliding does not turn round, and no energy comes in the surface's frame
+    # friction adds no energy in the surface's frame: the sliding does not turn round
     assert np.all(np.einsum("ni,ni->n", after - surface, v - surface)[hit] > -1e-5)
     separating = before_n > 1e-4
     assert np.array_equal(after[separating], v[separating].astype(np.float32).astype(float))

@@ -1,4 +1,4 @@
-"""What goes wrong is flagged, stops there, and touches no other environment."""
+"""Failures: flagged, frozen, and contained in their environment."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_failed_environment_is_frozen(three, fault):
     assert np.array_equal(after["F"][VICTIM], frozen["F"][VICTIM], equal_nan=True)
     moved = np.abs(after["x"] - frozen["x"]).max(axis=(1, 2))
     assert moved[0] > 0.01 and moved[2] > 0.01
-    expected, again = (three().run(2).state.numpy() for _ in range(2))  # the first begins where the failure was
+    expected, again = (three().run().state.numpy() for _ in range(2))  # the first begins where the failure was
     np.testing.assert_array_equal(again["x"], expected["x"])
 
 

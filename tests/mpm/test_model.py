@@ -1,4 +1,4 @@
-"""What cannot run is refused with the value, the limit and the remedy; what can is sized by rule."""
+"""Models: refusals with value, limit and remedy; sizes and time steps by rule."""
 
 from __future__ import annotations
 

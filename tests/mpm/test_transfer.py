@@ -23,7 +23,7 @@ def strain(F):
 
 @pytest.mark.parametrize("decoupling", ["split", "paper", "none", "no_stress"])
 def test_momentum_of_a_free_body_is_kept(simulate, decoupling):
-    # Linear and angular momentum, to round-off, while it deforms by tens of percent and is driven by ``vk``.
+    # Linear and angular momentum, to round-off, while it deforms by tens of percent and moves by ``vk``.
     rng = np.random.default_rng(2)
     sim = simulate(num_substeps=40, decoupling=decoupling, control_dt=0.06, young_modulus=1.0e4)
     u, C = smooth_velocity(sim.rest, 1) + [0.5, -0.3, 0.2], rng.normal(size=(len(sim.rest), 3, 3))

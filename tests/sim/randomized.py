@@ -23,11 +23,11 @@ def factors_of(batch) -> dict[str, np.ndarray]:
 def constants_of(batch, avatar: int = 0) -> dict[str, np.ndarray]:
     """Return the constants that follow from the factors, a row an environment."""
     sim, n = batch.simulation, batch.num_envs
-    model, drive = sim.model, sim.avatars[avatar]
-    own = slice(drive.body.first, drive.body.first + drive.body.count)
+    model, own_avatar = sim.model, sim.avatars[avatar]
+    own = slice(own_avatar.body.first, own_avatar.body.first + own_avatar.body.count)
     subject = model.contact.subject.numpy()
     found = {name: getattr(model.particles, name).numpy()[:, own] for name in ("mass", "mu", "lam", "volume")}
-    found |= {"bone_mass": drive.body.bone_mass.numpy(), "body_mass": drive.body_mass.numpy()[:, None]}
+    found |= {"bone_mass": own_avatar.body.bone_mass.numpy(), "body_mass": own_avatar.body_mass.numpy()[:, None]}
     found |= {"density": model.contact.density.numpy()[:, subject == avatar]}
     found |= {"ground": model.boundaries.friction.numpy(), "pairs": model.contact.friction.numpy()}
     return {name: np.broadcast_to(array, (n, array.shape[1])).copy() for name, array in found.items()}

@@ -102,8 +102,8 @@ TWO = {"scene.avatars": [{"position": (-0.6, 0.0)}, {"position": (0.6, 0.0)}]}
 
 def constants_of(simulation, env: int, avatar: int = 0) -> dict[str, np.ndarray]:
     """Return all that depends on an avatar's shape in an environment."""
-    drive, particles = simulation.avatars[avatar], simulation.model.particles
-    body = drive.body
+    own_avatar, particles = simulation.avatars[avatar], simulation.model.particles
+    body = own_avatar.body
     own = slice(body.first, body.first + body.count)
     found = {
         "rest": body.rest,
@@ -112,7 +112,7 @@ def constants_of(simulation, env: int, avatar: int = 0) -> dict[str, np.ndarray]
         "velocity_lag": body.velocity_lag,
     }
     found |= {"bone_mass": body.bone_mass, "mass": particles.mass[:, own], "volume": particles.volume[:, own]}
-    return {name: array.numpy()[env] for name, array in found.items()} | {"total": drive.body_mass.numpy()[env]}
+    return {name: array.numpy()[env] for name, array in found.items()} | {"total": own_avatar.body_mass.numpy()[env]}
 
 
 def expected_of(flesh, parameters: np.ndarray) -> dict[str, np.ndarray]:

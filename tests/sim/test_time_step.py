@@ -1,4 +1,4 @@
-"""What is known to be fast beforehand gets substeps in which it goes less than a grid spacing."""
+"""Substeps of worlds with fast parts: each moves less than a grid spacing in one."""
 
 from __future__ import annotations
 
