@@ -52,12 +52,12 @@ def ended_with(name: str, folder: Path, device: str, *settings: str) -> str:
 def test_an_absurd_learning_rate_ends_in_a_line(name, device, tmp_path):
     *_, algorithm, rollout = TRAININGS[name]
     message = ended_with(name, tmp_path / "run", device, f"{algorithm}.learning_rate=1e30")
-    told = re.fullmatch(
+    matched = re.fullmatch(
         r"error: the training has diverged: .+ is (nan|-?inf), not finite, after (\d+) steps; begin anew in another "
         rf"folder \(--out\) with a smaller {algorithm}.learning_rate, now 1e\+30(; .+checkpoint.pt is left .+)?",
         message,
     )
-    assert told and int(told[2]) % rollout == 0 < int(told[2]), message
+    assert matched and int(matched[2]) % rollout == 0 < int(matched[2]), message
     assert not {"policy.pt", "policy.zip", "results.json"} & {entry.name for entry in (tmp_path / "run").iterdir()}
 
 

@@ -126,7 +126,7 @@ def test_over_seeds_seeds_and_episodes_are_samples():
     interval = stats.t.interval(0.95, 4, np.mean(values), stats.sem(values))
     np.testing.assert_allclose(row["return_interval"], interval)
     np.testing.assert_allclose(row["steps_interval"], 10.0 * np.array(interval))
-    # where seeds are all alike, five of them know no more than one does: they have played the same episodes
+    # where seeds are all alike, five are no more certain than one: they have played the same episodes
     alike = over_seeds(rows([4.0] * 5, [0.95] * 5))
     np.testing.assert_allclose(alike["return_interval"], [3.5, 4.5])
     np.testing.assert_allclose(alike["success_once_interval"], wilson(0.95, 40.0, stats.t.ppf(0.975, 39)))
@@ -182,5 +182,5 @@ def test_pushes_fall_into_classes_and_pool_over_seeds():
     pooled = over_seeds([one, one])["by_push"]
     assert [row["episodes"] for row in pooled] == [4, 2, 6]
     assert [row["lasted"] for row in pooled] == pytest.approx([1.0, 0.0, 1.0 / 3.0])
-    # both have played the same episodes, so they know no more than one
+    # both have played the same episodes, so they are no more certain than one
     assert pooled[2]["lasted_interval"] == pytest.approx(share_interval([True, False, False]))

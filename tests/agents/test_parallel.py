@@ -1,4 +1,4 @@
-"""Folding: every slot is one agent and gets what is its own, and whoever has left does not poison the learner."""
+"""Folding: a slot is one agent and gets its own data; agents that have left do not reach the learner."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def test_the_integral_takes_away_the_sag_of_gravity():
 
 
 def test_an_integral_that_is_of_no_effect_gives_way():
-    """Held fast while it pulls as strongly as it may, then let go: without anti-windup it overshoots the more, the
+    """Held fast while it pulls as strongly as it may, then released: without anti-windup it overshoots the more, the
     longer it was held; with back-calculation always the same, and little."""
     kp, kd, ki, limit = 40.0, 6.0, 40.0, 15.0
 

@@ -1,4 +1,4 @@
-"""The PID agent in the simulation: it asks for what joints get, goes where it is told, and stands where others fall."""
+"""The PID agent in the simulation: joints go where they are commanded, and it stands where others fall."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ TINY = (
 
 @pytest.fixture(scope="module", autouse=True)
 def kernels(device):
-    """Compiled once: parallel test workers would race each other's files."""
+    """Compile once: parallel test workers would race each other's files."""
     with only_one_process("kernels"):
         skrl_mappo.find_world("high_five_v0")
         wp.force_load(device)
@@ -94,7 +94,7 @@ def played(mappo, env, steps: int) -> list[dict]:
     mappo.init()
     mappo.enable_training_mode(True)
     observed, _ = env.reset(seed=1)
-    state, told = env.state(), []
+    state, steps_taken = env.state(), []
     for step in range(steps):
         where = {"timestep": step, "timesteps": steps}
         with torch.no_grad():
@@ -102,7 +102,7 @@ def played(mappo, env, steps: int) -> list[dict]:
             after, rewards, terminated, truncated, infos = env.step(actions)
             infos["acted"]["agent_1"][0] = step < 2
             column = [{k: v.view(-1, 1) for k, v in flags.items()} for flags in (rewards, terminated, truncated)]
-            told.append({"rewards": rewards, "truncated": truncated, "infos": infos, "after": after})
+            steps_taken.append({"rewards": rewards, "truncated": truncated, "infos": infos, "after": after})
             mappo.record_transition(
                 observations=observed, states=dict.fromkeys(env.agents, state), actions=actions,
                 rewards={k: v.clone() for k, v in column[0].items()}, next_observations=after,
@@ -110,7 +110,7 @@ def played(mappo, env, steps: int) -> list[dict]:
                 infos=infos, **where,
             )  # fmt: skip
         observed, state = after, env.state()
-    return told
+    return steps_taken
 
 
 def test_a_time_out_is_worth_what_its_own_end_is_worth(config, env, tmp_path):
@@ -119,8 +119,8 @@ def test_a_time_out_is_worth_what_its_own_end_is_worth(config, env, tmp_path):
     mappo = skrl_mappo.build(config, env, tmp_path)
     for critic in mappo.values.values():
         torch.nn.init.normal_(critic.net[-1].weight)
-    told = played(mappo, env, 18)
-    last = told[-1]
+    steps_taken = played(mappo, env, 18)
+    last = steps_taken[-1]
     assert all(flags.all() for flags in last["truncated"].values()), "an episode has 9 steps"
     for name in env.agents:
         stored = mappo.memories[name].get_tensor_by_name("rewards")[8, :, 0]
@@ -130,7 +130,7 @@ def test_a_time_out_is_worth_what_its_own_end_is_worth(config, env, tmp_path):
         expected = last["rewards"][name] + config.mappo.discount * ends
         assert torch.allclose(stored, expected, atol=1e-5) and (starts - ends).abs().min() > 1e-3
     assert mappo.curve.steps == [18, 18, 36, 36]
-    means = torch.stack([torch.stack(list(one["rewards"].values())).mean(dim=0) for one in told])
+    means = torch.stack([torch.stack(list(one["rewards"].values())).mean(dim=0) for one in steps_taken])
     assert mappo.curve.returns == pytest.approx(means.view(2, 9, 2).sum(dim=1).flatten().tolist(), abs=1e-6)
 
 
@@ -150,7 +150,7 @@ def test_only_an_agents_own_steps_are_learned_from(device):
     counted = torch.cat([batch[1] for batch in batches]).flatten()
     assert counted.mean().item() == pytest.approx(0.0, abs=1e-5)
     assert counted.std(unbiased=False).item() == pytest.approx(1.0, rel=1e-4)
-    # what is learned does not depend on what the dead would have been worth
+    # what is learned does not depend on steps of agents that were out
     alone = torch.tensor([1.0, 2.0, 3.0, 6.0])
     expected = (alone - alone.mean()) / alone.std(unbiased=False)
     assert sorted(counted.tolist()) == pytest.approx(sorted(expected.tolist()), abs=1e-5)
