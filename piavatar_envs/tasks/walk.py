@@ -10,7 +10,6 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.episodes import Bones, Episodes, Outcome
@@ -97,9 +96,9 @@ class Way:
 
 
 @wp.func
-def way_gone(way: Way, body: Body, e: int, pelvis: wp.vec3):
-    """Return the distances of a pelvis along the way and to its left [m]."""
-    off = pelvis - pelvis_at(way.start, body, e)
+def way_gone(way: Way, bones: Bones, e: int):
+    """Return the distances of the pelvis along the way and to its left [m]."""
+    off = bones.position[e, 0] - pelvis_at(way.start, bones.body, e)
     ahead = forward_of(way.start[2])
     left = wp.cross(wp.vec3(0.0, 0.0, 1.0), ahead)
     return wp.vec2(wp.dot(off, ahead), wp.dot(off, left))
@@ -125,7 +124,7 @@ def judge_walk(
     facing = wp.quat_rotate(bones.rotation[e, 0], wp.vec3(0.0, -1.0, 0.0))
     facing[2] = 0.0
     off_way = wp.acos(wp.clamp(wp.dot(wp.normalize(facing), ahead), -1.0, 1.0))
-    gone = way_gone(way, bones.body, e, bones.position[e, 0])
+    gone = way_gone(way, bones, e)
     time = way.control_dt * float(episodes.step_count[e] + 1)
     mean_speed = gone[0] / time
     stride = float(0.0)
@@ -166,7 +165,7 @@ def observe_walk(
     """Write the way's direction, the distance from it and, with a clock, its phase from component ``start``."""
     e = wp.tid()
     write_vector(observation, e, agent, start, wp.quat_rotate_inv(bones.rotation[e, 0], forward_of(way.start[2])))
-    observation[e, agent, start + 3] = way_gone(way, bones.body, e, bones.position[e, 0])[1]
+    observation[e, agent, start + 3] = way_gone(way, bones, e)[1]
     if way.gait.worth > 0.0:
         phase = phase_of(way.gait, float(episodes.step_count[e]))
         observation[e, agent, start + 4] = wp.sin(phase)
