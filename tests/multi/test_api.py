@@ -62,7 +62,8 @@ assert listed_games()
 print([name for name in ("pettingzoo", "warp", "torch", "pyvista") if name in sys.modules])
 sys.modules["pettingzoo"] = None
 try:
-    import piavatar_envs.multi.sumo_v0
+    from piavatar_envs.multi import sumo_v0
+    sumo_v0.parallel_env()
 except ImportError as error:
     print(error)
 """
