@@ -24,6 +24,8 @@ from warp._src import build, context
 NAME = "gpu_on_cpu"
 #: Threads of a CUDA block unless a launch sets them.
 THREADS = 256
+#: Of the compiler: kernels take longer to compile than to run here.
+OPTIMIZATION = 1
 _HEADER = Path(__file__).with_name("threads.h")
 
 #: Lines in Warp's generated CPU modules: its headers, the begin and the end of a thread.
@@ -140,6 +142,7 @@ def gpu_on_cpu() -> Iterator[str]:
     get_device, compile_cpu, blocks = wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks
     make_stream, scoped_stream = wp.Stream, wp.ScopedStream
     caches = wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir
+    level, wp.config.optimization_level = wp.config.optimization_level, OPTIMIZATION
     build.init_kernel_cache(str(_own_cache()))
     context.runtime.device_map[NAME] = context.runtime.device_map["cpu"]
     wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = seen_device, build_cpu, True
@@ -148,6 +151,7 @@ def gpu_on_cpu() -> Iterator[str]:
     try:
         yield NAME
     finally:
+        wp.config.optimization_level = level
         wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = get_device, compile_cpu, blocks
         wp.Stream, wp.ScopedStream = make_stream, scoped_stream
         context._resolve_launch_block_dim = resolve
