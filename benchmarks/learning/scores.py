@@ -2,9 +2,8 @@
 
 ``python -m benchmarks.learning.scores --out FILE.json`` plays all registered ids and all modules of several agents.
 The policy is PPO's after ``train_steps`` control steps (of all agents together), with one setting for all
-environments: it shows that a task can be learned at all, not how well. Where ``configs/NAME_scores.yaml`` exists, its
-settings are taken. Returns are means over episodes with 95 % intervals, in worlds of several agents the mean over the
-agents.
+environments: it shows that a task can be learned at all, not how well. Returns are means over episodes with 95 %
+intervals, in games the mean over the agents.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from benchmarks import runner
 from piavatar_envs.multi import listed_games
 from piavatar_envs.tasks import task_modules
 
-ROOT = Path(__file__).resolve().parents[1]
 #: One setting for all: short episodes and dense rewards want a short horizon.
 GENERIC = {
     "ppo": {"rollout_steps": 512, "batch_size": 256, "discount": 0.95, "gae_lambda": 0.9, "log_std": -0.7},
@@ -57,16 +55,14 @@ def every_environment() -> list[str]:
 
 
 def training_config(env_id: str, options: Options) -> TrainingConfig:
-    """Return the training configuration of an environment, from its own file or the generic settings."""
-    own = ROOT / "configs" / f"{env_id.rpartition('/')[2].lower().replace('-', '_')}_scores.yaml"
-    source: Any = own if own.is_file() else {"env_id": env_id, **GENERIC}
+    """Return the training configuration of an environment, with the generic settings."""
     changes = {
         "total_steps": max(1, options.train_steps),
         "num_workers": options.workers,
         "env.fidelity": options.fidelity,
         "evaluation.episodes": options.episodes,
     }
-    return load_training(source, changes)
+    return load_training({"env_id": env_id, **GENERIC}, changes)
 
 
 def row(env_id: str, evaluation: Evaluation, trained_for: int | None = None) -> dict[str, Any]:
