@@ -203,13 +203,13 @@ def apply_impulse(
     body: Body,
     impulse: wp.array(dtype=wp.vec3),
     struck: wp.array(dtype=int),
-    episodes: Episodes,
+    failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
 ):
     """Distribute an impulse over the particles of the struck bone by their skinning weights; its sum is exact."""
     e, p = wp.tid()
-    if episodes.failure[e] != 0:
+    if failure[e] != 0:
         return
     b = struck[e]
     bones = bones_of(body.skin, p)
@@ -428,7 +428,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
         graph.launch(
             apply_impulse,
             (env.num_envs, avatar.num_points),
-            [avatar.body, self.impulse, self.struck, env.episodes],
+            [avatar.body, self.impulse, self.struck, env.simulation.state.failure],
             [env.simulation.state.u],
         )
         return [(self.reference_rotation, self.reference_root)]

@@ -312,7 +312,7 @@ def test_the_momentum_that_arrives_is_the_impulse(make_batch):
         velocity = wp.zeros_like(simulation.state.u)
         impulse = wp.array(J, dtype=wp.vec3, device=batch.device)
         struck = wp.array([bone, bone], dtype=int, device=batch.device)
-        inputs = [simulation.avatar.body, impulse, struck, batch.episodes]
+        inputs = [simulation.avatar.body, impulse, struck, simulation.state.failure]
         wp.launch(apply_impulse, (2, simulation.avatar.num_points), inputs, [velocity], device=batch.device)
         return velocity.numpy().astype(float)
 
