@@ -190,6 +190,7 @@ class Flesh:
             root_assist=control.root_assist,
             flesh_rate=attachment_rates(sampled.depth, distance, firm, *control.flesh_rate),
             firm_bones=(sampled.bone >= 0) & control.firm_bones,
+            links=sampled.links,
             bone_contact=control.bone_contact,
         )
 

@@ -114,6 +114,31 @@ class Joints:
         after, before = (self.rig.skinned(*self.moved(velocity, time)) for time in (1e-4, -1e-4))
         return (after - before) / 2e-4
 
+    def bias_change(self, velocity) -> np.ndarray:
+        """``M^-1 h``: centripetal and Coriolis forces of bones that have their share of each particle rigidly."""
+        x, at = self.rig.read("x"), self.body.state.position.numpy()[0].astype(float)
+        spins = carried_by().T @ velocity[3:].reshape(NUM_JOINTS, 3)
+        pull = np.zeros((NUM_JOINTS, 3))
+        for b in range(1, NUM_JOINTS):
+            spin = spins[PARENTS[b]]
+            pull[b] = pull[PARENTS[b]] + np.cross(spin, np.cross(spin, at[b] - at[PARENTS[b]]))
+        share = self.rig.weights / self.rig.weights.sum(1, keepdims=True) * self.rig.mass[:, None]
+        h = np.zeros(NUM_DOF)
+        for b in range(NUM_JOINTS):
+            force = share[:, b, None] * (pull[b] + np.cross(spins[b], np.cross(spins[b], x - at[b])))
+            h[:3] += force.sum(0)
+            for c in np.flatnonzero(carried_by()[:, b]):
+                h[3 + 3 * c : 6 + 3 * c] += np.cross(x - at[c], force).sum(0)
+        J, m = self.jacobian, self.rig.mass
+        return np.linalg.solve(np.einsum("p,pia,pib->ab", m, J, J) + np.diag(self.besides), h)
+
+    def skinned_now(self) -> np.ndarray:
+        """Skinned places of the particles in the current pose [m]."""
+        s = self.body.state
+        world = Rotation.from_quat(s.rotation.numpy()[0].astype(float)).as_matrix()
+        local = np.stack([world[0], *(world[PARENTS[b]].T @ world[b] for b in range(1, NUM_JOINTS))])
+        return self.rig.skinned(local, s.position.numpy()[0, 0].astype(float))
+
     def halfway(self, velocity) -> np.ndarray:
         """Return ``J`` half a step on, bones and particles moved by a velocity of the joints."""
         half = 0.5 * self.model.step.dt

@@ -78,13 +78,14 @@ class Lying:
         body.tracker.assign(np.full(body.tracker.shape, point, np.int32))
 
     def stop(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Let the body, which moves with its joints, do a substep; return their velocity before and after."""
+        """Let the body follow its joints for a substep; return their velocity without contact and with it."""
         made = self.joints
         made.body.state.velocity.assign(velocity[None].astype(np.float32))
         before = self.before
+        free = before + 0.5 * made.model.step.dt * made.bias_change(before)
         made.state.vk.assign(made.skinning(before)[None].astype(np.float32))
         made.substep(1).run()
-        return before, self.before
+        return free, self.before
 
 
 @pytest.fixture

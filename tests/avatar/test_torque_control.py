@@ -47,12 +47,12 @@ def test_mass_matrix_is_that_of_the_jacobian(joints, seed):
 
 
 def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
-    # ``(M + I) dq = J^T m v``; they move with ``J dq`` half a step on, and what is left is physical.
+    # ``(M + I) dq = J^T m v``; particles turn with their bones about skinned places, and what is left is physical.
     made = joints()
     made.state.u.assign(0.5 * made.state.u.numpy())  # half a step turns joints by 0.09 rad at most
     before, J, m = made.total, made.jacobian, made.rig.mass
     expected = np.linalg.solve(np.einsum("p,pia,pib->ab", m, J, J) + np.diag(made.besides), momentum_of(J, m, before))
-    vk = made.halfway(expected) @ expected
+    places, dt = made.skinned_now(), made.model.step.dt
     made.body.state.outside.assign(-expected[None].astype(np.float32))  # so that none is expected next
     made.substep(1).run()
     np.testing.assert_allclose(made.total, before, atol=2e-5)
@@ -61,11 +61,14 @@ def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
     left = momentum_of(J, m, before - J @ got) - made.besides * got
     size = np.sqrt(np.einsum("p,pia,pia->a", m, J, J))
     assert np.abs(left / size).max() < 2e-3 * np.abs(momentum_of(J, m, before) / size).max()
-    straight = np.abs(vk - J @ expected).max()
-    assert np.abs(made.rig.read("vk") - vk).max() < max(1e-4, 0.05 * straight)
     bones = carried_by().T @ got[3:].reshape(NUM_JOINTS, 3)  # a bone spins with all joints that carry it
     weights = made.rig.weights / made.rig.weights.sum(1, keepdims=True)
-    np.testing.assert_allclose(made.rig.read("spin"), weights @ bones, atol=1e-4)
+    spin = made.rig.read("spin")
+    np.testing.assert_allclose(spin, weights @ bones, atol=1e-4)
+    turn = np.cross(spin, made.rig.read("x") - places)
+    vk = (made.skinned_now() - places) / dt + turn + 0.5 * dt * np.cross(spin, turn)
+    assert np.abs(vk - J @ expected).max() > 0.05
+    np.testing.assert_allclose(made.rig.read("vk"), vk, atol=3e-4)
 
 
 @pytest.mark.parametrize("attachment", [None, 200.0])
@@ -78,15 +81,13 @@ def test_particles_go_from_skinned_places_to_skinned_places(make_rig, wild_pose,
     made.state.u.zero_()
     made.state.vk.assign(made.skinning(velocity)[None].astype(np.float32))
     home, dt = made.rig.read("x"), made.model.step.dt
-    alone = made.halfway(velocity) @ velocity
+    alone, bias = made.halfway(velocity) @ velocity, made.bias_change(velocity)
     made.substep(1).run()
-    got, now = made.body.state.velocity.numpy()[0].astype(float), made.body.state.rotation.numpy()[0].astype(float)
-    np.testing.assert_allclose(got, velocity, atol=0.02 * np.abs(velocity).max())
-    world = Rotation.from_quat(now).as_matrix()
-    local = np.stack([world[0], *(world[PARENTS[b]].T @ world[b] for b in range(1, NUM_JOINTS))])
-    way = made.rig.skinned(local, made.body.state.position.numpy()[0, 0].astype(float)) - home
-    off = np.linalg.norm(dt * made.rig.read("vk") - way, axis=1).max()
-    assert off < 0.1 * np.linalg.norm(dt * alone - way, axis=1).max()
+    got = made.body.state.velocity.numpy()[0].astype(float)
+    predicted = 0.5 * dt * bias  # of the bias forces, half is predicted
+    assert np.linalg.norm(got - velocity - predicted) < 0.1 * np.linalg.norm(predicted)
+    way = made.skinned_now() - home
+    assert np.linalg.norm(dt * made.rig.read("vk") - way, axis=1).max() < 1e-6
     assert np.linalg.norm(dt * alone - way, axis=1).max() > 1e-3 * np.linalg.norm(way, axis=1).max()
 
 
@@ -245,7 +246,7 @@ def test_threads_and_partitions_change_nothing(joints, monkeypatch, attachment):
     assert divided.rig.points.num_points > 200
     for name in ("u", "vk"):
         expected = whole.rig.read(name)
-        np.testing.assert_allclose(divided.rig.read(name), expected, atol=2e-5 * np.abs(expected).max(), err_msg=name)
+        np.testing.assert_allclose(divided.rig.read(name), expected, atol=4e-5 * np.abs(expected).max(), err_msg=name)
     speed = whole.body.state.velocity.numpy()
     np.testing.assert_allclose(divided.body.state.velocity.numpy(), speed, atol=2e-5 * np.abs(speed).max())
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.physics.rig import joint_gaps
-from benchmarks.physics.wear import set_spinning, straight_growth, widths
+from benchmarks.physics.wear import set_spinning, stored_energy, straight_growth, strain, swing_legs, widths
 from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.skeleton import PARENTS, joint_index
 from piavatar_envs.avatar.torque_control.bone_contact import LAYER
@@ -33,6 +33,37 @@ def swing(batch, steps: int, seed: int = 0) -> np.ndarray:
     return np.array(gaps)
 
 
+def test_flesh_does_not_wear_out_in_limbs_that_swing(make_batch):
+    # Inertia strains it by 4e-4; integration errors once added 2.6e-3 a second, and stayed when limbs came to rest.
+    settings = {"fidelity": "coarse", "root_assist": 1.0, "control": "pd", "pose_noise": 0.0, **EMPTY}
+    batch = make_batch("PIAvatar/Stand-v0", 1, **settings)
+    batch.reset(seeds=[0])
+    swing_legs(batch, 3.0)
+    assert not batch.failure.numpy().any()
+    assert 1e-4 < strain(batch).mean() < 8e-4
+    batch.action.zero_()
+    for _ in range(30):
+        batch.step()
+    assert strain(batch).mean() < 3e-4
+    assert stored_energy(batch) < 0.002  # [J]; 0.3 once
+
+
+def test_a_spinning_body_keeps_its_kinetic_energy(make_batch):
+    # 8 rad/s about the vertical, free: after it has given way to its inertia, nothing is lost to the flesh.
+    settings = {"fidelity": "coarse", "control": "pd", "pose_noise": 0.0, **EMPTY}
+    batch = make_batch("PIAvatar/Stand-v0", 1, **settings)
+    batch.reset(seeds=[0])
+    set_spinning(batch, 8.0)
+    mass, energy = batch.simulation.model.particles.mass.numpy()[0].astype(float), []
+    for step in range(75):
+        batch.step()
+        if step in (29, 74):
+            state = batch.simulation.state.numpy()
+            energy.append(0.5 * mass @ ((state["u"] + state["vk"])[0].astype(float) ** 2).sum(1))
+    assert energy[1] == pytest.approx(energy[0], rel=2e-3)
+    assert strain(batch).mean() < 2e-3
+
+
 def put_in_place(batch) -> None:
     """Run the end of a control step alone, wherever joints have been put."""
     simulation = batch.simulation
@@ -48,7 +79,7 @@ def of_bones(batch) -> np.ndarray:
 
 
 def test_bones_stay_together(make_batch):
-    # Under random targets; where they slip they are millimetres apart.
+    # Under random targets; where they may slip they are a third of a millimetre apart.
     worst = {}
     for firm in (True, False):
         batch = make_batch(REACH, 2, **PD | {"firm_bones": firm}, **EMPTY)
@@ -56,7 +87,7 @@ def test_bones_stay_together(make_batch):
         worst[firm] = swing(batch, 30).max()
         assert not batch.failure.numpy().any()
     assert worst[True] < 1e-5
-    assert worst[False] > 1e-3
+    assert worst[False] > 1e-4
 
 
 def test_bones_on_the_floor_are_apart_only_where_they_press_on_it(make_batch):

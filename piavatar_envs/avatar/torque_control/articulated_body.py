@@ -15,7 +15,14 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
 2. *Mass matrix* ``M = J^T m J``, if due; see :mod:`piavatar_envs.avatar.torque_control.mass_matrix`.
 3. *Projection.* The joints take over what they can of the physical velocity::
 
-       M dq = J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq
+       M dq = J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq + dt M^-1 h / 2
+
+   ``h`` are the bias forces ``J^T m Jdot qdot``
+   (:func:`~piavatar_envs.avatar.torque_control.joint_momentum.bias_forces`). The change of ``J qdot`` with the pose
+   enters ``u`` in two halves: one in step 5, before the particles move, one in step 1 of the next substep. The
+   projection counts both in ``c``, but only the second is still to come when step 5 predicts it. Predicted twice, the
+   first half would move particles in ``u`` and bones in ``vk`` against each other, and strain the flesh by
+   ``dt (omega A)^2`` in every swing of amplitude ``A``.
 
    For light joints inertia is added for the projection only; the torque solve omits it
    (:func:`~piavatar_envs.avatar.torque_control.mass_matrix.grid_inertia`).
@@ -29,13 +36,14 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
    rigid motion that ``J d`` has in excess is subtracted, computed from the current moments of the bones.
 5. *Advance.* The joints move on with the predicted velocity, and particles get the rest::
 
-       qdot <- qdot + d + c,   u <- u - J c,   vk = J qdot
+       qdot <- qdot + d + c,   u <- u - J c,   vk = (LBS' - LBS) / dt + ((R - I) / dt) (x - LBS)
 
    The predicted reaction ``-J c`` is added to ``u``, so that contact can cancel it. For a free limb ``c = 0``; a limb
    blocked by the ground does not move. If the predicted change does not occur, the next projection takes ``-J c`` back.
-   ``vk`` uses ``J`` at the middle of the substep (explicit midpoint rule), so that turning limbs keep their width, and
-   includes the velocity that skinning adds where bones place a particle differently
-   (:func:`~piavatar_envs.avatar.torque_control.joint_motion.motion_apart`).
+   ``vk`` leads particles from their skinned places ``LBS`` to those at the end of the substep, ``LBS'``, and turns what
+   lies between with the rotation ``R`` of their bones
+   (:func:`~piavatar_envs.avatar.torque_control.flesh_coupling.split_velocity`). Its difference from ``J qdot`` goes to
+   ``u``.
 6. *Fit*, after a new mass matrix: the pose is moved by a share of ``M^-1 J^T m (x - LBS)``, with the particles'
    displacements from their skinned places ``LBS`` at the beginning of the substep.
 
@@ -55,6 +63,7 @@ Symbols:
 ``tau``      torques of the joints
 ``p, J_b``   impulses on points of bones that touch a boundary, and the Jacobian of these points
 ``d``        velocity change by step 4
+``h``        bias forces: centripetal and Coriolis forces of the bones at constant ``qdot``
 ``c``        velocity change from contact, gravity and flesh in the previous substep, the prediction for this one
 ===========  ===========================================================================================
 
@@ -69,6 +78,7 @@ Limits:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -79,8 +89,8 @@ from piavatar_envs.avatar.body.device import BodyPoints, partition_body
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.segment_sums import ALL_WORDS, PARTITION_THREADS, sum_moments, warps_of
 from piavatar_envs.avatar.torque_control.bone_contact import Ground
-from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, put_in_place
-from piavatar_envs.avatar.torque_control.joint_motion import split_velocity
+from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, put_in_place, split_velocity
+from piavatar_envs.avatar.torque_control.flesh_strain import RATE, correct_strain, find_places, make_neighbours
 from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, MassMatrix, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
@@ -119,6 +129,7 @@ class ArticulatedBody:
         attachment: np.ndarray | None = None,
         firm: np.ndarray | None = None,
         solid: bool = False,
+        links: np.ndarray | None = None,
     ) -> None:
         """Allocate the joints of a body in every environment.
 
@@ -133,6 +144,8 @@ class ArticulatedBody:
             firm: flags of the particles that are moved to their skinned places after every control step, shape
                 ``(num_points,)`` bool; none if not given.
             solid: whether bones stop at boundaries, see :mod:`piavatar_envs.avatar.torque_control.bone_contact`.
+            links: pairs of neighbouring particles, shape ``(L, 2)``, from which their strain is measured after every
+                control step; without them it is integrated only.
 
         Raises:
             ValueError: a stiffness, damping or rate is negative or not finite, or a shape is wrong.
@@ -168,6 +181,8 @@ class ArticulatedBody:
         self._scratch = wp.zeros(words, dtype=float, device=device)
         self.impulse = wp.zeros((n, NUM_DOF), dtype=float, device=device)
         self.support = allocate(Support, n, device)
+        self._neighbours = None if links is None else make_neighbours(links, points.num_points, device)
+        self._places = wp.zeros((n, 0 if links is None else points.num_points), dtype=wp.vec3, device=device)
         self._workspace = self._allocate()
         without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
         self.set_strength(-everywhere, everywhere, 1)
@@ -198,9 +213,9 @@ class ArticulatedBody:
             diagonals=rows(2, NUM_DOF),
             moments=chunks,
             other_moments=chunks,
-            linear=rows(3, NUM_JOINTS, wp.vec3),
-            angular=rows(3, NUM_JOINTS, wp.vec3),
-            shares=rows(3, NUM_DOF),
+            linear=rows(4, NUM_JOINTS, wp.vec3),
+            angular=rows(4, NUM_JOINTS, wp.vec3),
+            shares=rows(4, NUM_DOF),
             touch=rows(3, NUM_DOF),
             whole=NUM_DOF,
             muscle=NUM_DOF,
@@ -270,7 +285,7 @@ class ArticulatedBody:
         inputs = [self.body, model.step.dt, 1.0 / model.control_dt, 3 if fit else 2]
         inputs += [self.target, self.springs, self.tissue, self.strength]
         self._record_stage(graph, act, inputs, state, self._ground(scratch), self.support)
-        inputs = [self.body, model.step.dt, state.x, w.pelvis, w.steps, state.failure]
+        inputs = [self.body, model.step.dt, state.x, w, state.failure]
         graph.launch(split_velocity, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
     def _ground(self, scratch: Scratch) -> Ground:
@@ -291,16 +306,23 @@ class ArticulatedBody:
         dim = (self.model.num_envs, self._partitions.start.shape[0] - 1, block)
         inputs = [self.body, self._partitions, self.model.step.dt, self.model.particles.mass]
         inputs += [state.x, self.attachment, state.failure, self._scratch]
-        graph.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._workspace], block_dim=PARTITION_THREADS)
+        graph.launch(
+            attach_flesh, dim, inputs, [state.u, state.kinematic, self._workspace], block_dim=PARTITION_THREADS
+        )
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
-        """Append the end of a control step: firm particles are moved to their skinned places.
+        """Append the end of a control step: strain is measured, and firm particles are moved to their skinned places.
 
         Grid blocks are not activated for the new positions; the next control step activates all.
         """
+        model, w = self.model, self._workspace
+        if self._neighbours is not None:
+            dim = (model.num_envs, self.body.count)
+            graph.launch(find_places, dim, [self.body, w.place, state.failure], [self._places])
+            inputs = [self.body, -math.expm1(-RATE * model.control_dt), self._neighbours, state.x, self._places]
+            graph.launch(correct_strain, dim, [*inputs, state.failure], [state.F])
         if self.firm.size == 0:
             return
-        model, w = self.model, self._workspace
         inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, w.pose.position, state.u, state.vk]
         inputs += [state.failure]
         graph.launch(put_in_place, model.num_envs * self.firm.size, inputs, [state.x, state.C, self.state.slip])

@@ -53,6 +53,7 @@ class TorqueControl:
         root_assist: initial assistance of the pelvis, 0 to 1.
         flesh_rate: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
         firm_bones: particles that are moved to their skinned places after every control step, ``(P,)`` bool.
+        links: pairs of neighbouring particles, from which strain is measured, shape ``(L, 2)``.
         bone_contact: whether bones stop at boundaries.
     """
 
@@ -60,6 +61,7 @@ class TorqueControl:
     root_assist: float
     flesh_rate: np.ndarray
     firm_bones: np.ndarray
+    links: np.ndarray
     bone_contact: bool
 
 
@@ -189,7 +191,9 @@ class TorqueController:
         self.avatar = avatar
         rows = np.zeros((n, 1 + NUM_JOINTS))
         flesh = parameters.flesh_rate[None], parameters.firm_bones
-        self.joints = ArticulatedBody(points, avatar.body, model, rows, rows, *flesh, parameters.bone_contact)
+        self.joints = ArticulatedBody(
+            points, avatar.body, model, rows, rows, *flesh, parameters.bone_contact, parameters.links
+        )
         self.joints.set_strength(muscles.lower, muscles.upper, n)
         ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]

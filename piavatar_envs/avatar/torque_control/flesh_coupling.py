@@ -16,14 +16,33 @@ from piavatar_envs.avatar.segment_sums import (
     store_second_vectors,
     sum_chunk,
 )
-from piavatar_envs.avatar.skinning import blend_back, blend_images, skinned_place
+from piavatar_envs.avatar.skinning import blend_back, blend_images, blend_places, blend_steps, skinned_place
 from piavatar_envs.avatar.torque_control.joint_motion import blended_motion, motion_apart
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.core.arrays import int_at, matrix_at, number_at, prefetch_rows, set_vector, store_matrix, vector_at
-from piavatar_envs.core.cuda_intrinsics import environment_of, lane_of_warp, sync_block, threads_of_block, warp_of_block
+from piavatar_envs.core.arrays import (
+    int_at,
+    matrix_at,
+    number_at,
+    prefetch_rows,
+    set_vector,
+    store_matrix,
+    store_triple,
+    vector_at,
+    vector_from,
+)
+from piavatar_envs.core.cuda_intrinsics import (
+    BLOCK,
+    environment_of,
+    first_particle,
+    lane_of_warp,
+    sync_block,
+    threads_of_block,
+    threads_of_environment,
+    warp_of_block,
+)
 from piavatar_envs.mpm.colliders import signed_distance
-from piavatar_envs.mpm.types import Boundaries, Grid, row
+from piavatar_envs.mpm.types import Boundaries, Grid, Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -64,7 +83,7 @@ def attach_flesh(
     scratch: wp.array(dtype=float),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    vk: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
     w: TorqueWorkspace,
 ):
     """Update ``u`` to the new ``J``, pull every particle to its skinned place, and sum moments of the bones.
@@ -92,26 +111,73 @@ def attach_flesh(
     pelvis = vector_at(w.pose.position, e, 0)
     prefetch_rows(x, e, body.first + first, last - first, thread)
     prefetch_rows(u, e, body.first + first, last - first, thread)
-    prefetch_rows(vk, e, body.first + first, last - first, thread)
+    prefetch_rows(driven.vk, e, body.first + first, last - first, thread)
     while p < last:
         n = body.first + p
         arm = vector_at(x, e, n) - pelvis
-        v = vector_at(u, e, n) + vector_at(vk, e, n)
+        v = vector_at(u, e, n) + vector_at(driven.vk, e, n)
         m = number_at(mass, r, n)  # loaded before any store, to avoid waiting for it
         own_rate = number_at(rate, row(e, rate.shape[0]), p)
         now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w))
         apart = wp.vec3()
         if p >= body.alone:
             apart = motion_apart(now)
-            set_vector(vk, e, n, apart)
+            set_vector(driven.vk, e, n, apart)
         before = v - blended_motion(now, arm) - apart
         way = wp.vec3(now[6], now[7], now[8]) - arm
+        set_vector(driven.spin, e, n, way)
         after = implicit_velocity(own_rate, dt, way, before)
         store_point(arena, partitions.size, p - first, m, arm, before - after, after, way)
         p += threads
     sync_block()
     store_second_vectors(arena, last - first, thread, threads, e, body.first + first, u)
     sum_partition(partitions, arena, pelvis, e, at[1], w)
+
+
+@wp.kernel(launch_bounds=(BLOCK, 10))
+def split_velocity(
+    body: Body,
+    dt: float,
+    x: wp.array2d(dtype=wp.vec3),
+    w: TorqueWorkspace,
+    failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
+):
+    """Write the velocity ``vk`` of the joints' motion in this substep, and set ``u`` to the rest of the total velocity.
+
+    ``vk`` leads exactly to the particle's place at the end of the substep: it is the chord between its two skinned
+    places, and turns its displacement from them. Moved along ``J qdot`` of the substep's beginning, a particle that
+    turns by ``theta`` would end ``1 + theta^2 / 2`` times as far from its axis; ``u`` would have to lead it back, and
+    its gradient would strain the flesh, always in the same sense.
+
+    The total velocity is ``u`` plus the first of the bones' motions in ``steps``, about the pelvis joint at the
+    beginning, plus the motion apart that :func:`attach_flesh` leaves in ``vk``. The second motion in ``steps``, that of
+    the midpoint, gives the spin. :func:`attach_flesh` leaves the displacements to the skinned places in ``spin``.
+    """
+    i, _ = wp.tid()
+    threads = threads_of_environment(x.shape[0])
+    own = first_particle(i, threads)
+    e = own[0]
+    if failure[e] != 0:
+        return
+    p = own[1]
+    center = w.pelvis[e]
+    while p < body.count:
+        n = body.first + p
+        arm = vector_at(x, e, n) - center
+        total = vector_at(u, e, n)
+        way = vector_at(driven.spin, e, n)
+        apart = vector_from(driven.vk, body.first + body.alone, e, n)
+        steps = blend_steps(w.steps, e, body.skin, p)
+        end = blend_places(w.end, e, body.skin, p, pulled_rest(body, e, p, w))
+        spin = wp.vec3(steps[9], steps[10], steps[11])
+        turn = wp.cross(spin, way)
+        vk = (end - way - arm) / dt - turn - 0.5 * dt * wp.cross(spin, turn)
+        total += blended_motion(steps, arm) + apart
+        store_triple(u, driven.vk, driven.spin, e, n, total - vk, vk, spin, True)
+        p += threads
 
 
 @wp.func

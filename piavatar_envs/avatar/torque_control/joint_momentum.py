@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.skinning import motion_at
-from piavatar_envs.avatar.torque_control.joint_motion import set_triple
+from piavatar_envs.avatar.torque_control.joint_motion import add_ancestors3, set_triple
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, I3, NUM_DOF
 from piavatar_envs.avatar.tracking import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body
@@ -63,6 +63,80 @@ def predict_velocity(
         after = q[e, i] + change[own, i] + outside[e, i]
         q[e, i] = after
         taken[row, i] = after - taken[row, i] - outside[e, i]
+
+
+@wp.func
+def expect_half(
+    change: wp.array2d(dtype=float),
+    row: int,
+    dt: float,
+    e: int,
+    thread: int,
+    threads: int,
+    # in and out
+    outside: wp.array2d(dtype=float),
+):
+    """Add half the substep's change by bias forces, ``change[row]`` [1/s], to the predicted change ``outside``.
+
+    ``outside`` contains their whole change, with the opposite sign. Half of it the particles have when they move.
+    """
+    sync_threads(threads)
+    for i in range(thread, NUM_DOF, threads):
+        outside[e, i] = outside[e, i] + 0.5 * dt * change[row, i]
+
+
+@wp.func
+def centripetal(
+    body: Body, position: wp.array2d(dtype=wp.vec3), moving: wp.array2d(dtype=vec8), e: int, b: int
+) -> wp.vec3:
+    """Return the acceleration of joint ``b`` relative to its parent, of constant ``qdot`` [m/s^2]; 0 for the pelvis."""
+    if b == 0:
+        return wp.vec3()
+    a = body.parent[b]
+    spin = wp.vec3(moving[e, a][3], moving[e, a][4], moving[e, a][5])
+    return wp.cross(spin, wp.cross(spin, position[e, b] - position[e, a]))
+
+
+@wp.func
+def bias_forces(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    bones: wp.array2d(dtype=vec16),
+    moving: wp.array2d(dtype=vec8),
+    row: int,
+    e: int,
+    thread: int,
+    threads: int,
+    # out
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+):
+    """Write ``m Jdot qdot`` of every bone to ``linear[row]`` [N], its moment about the joint to ``angular[row]`` [N m].
+
+    These are the centripetal and Coriolis terms of articulated bodies (Featherstone, Rigid Body Dynamics Algorithms,
+    2008, section 5.2), from the bones' moments and their rigid motions ``moving``. Spins of joints relative to their
+    parents are components of ``qdot`` in the world frame, so constant ones turn no bone faster.
+    """
+    sync_threads(threads)
+    if threads == 1:
+        for b in range(BONES):
+            pull = centripetal(body, position, moving, e, b)
+            if b > 0:
+                pull += angular[row, body.parent[b]]
+            angular[row, b] = pull
+    else:
+        own = wp.min(thread, BONES - 1)
+        pull = add_ancestors3(centripetal(body, position, moving, e, own), body.parent[own], body.levels)
+        if thread < BONES:
+            angular[row, own] = pull
+    for b in range(thread, BONES, threads):
+        s = bones[e, b]
+        spin = wp.vec3(moving[e, b][3], moving[e, b][4], moving[e, b][5])
+        first = wp.vec3(s[1], s[2], s[3])
+        second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
+        pull = angular[row, b]
+        linear[row, b] = s[0] * pull + wp.cross(spin, wp.cross(spin, first))
+        angular[row, b] = wp.cross(first, pull) - wp.cross(spin, second * spin)
 
 
 # A lane of a warp sums one of the 28 numbers, so that those of a chunk are loaded at once, several chunks ahead.
@@ -154,7 +228,7 @@ def add_child(
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 constexpr unsigned ALL = 0xffffffffu;
-constexpr int VECTORS = 3;
+constexpr int VECTORS = 4;
 const int bones = parent.shape[0], lane = threadIdx.x & 31, own = min(lane, bones - 1);
 const int above = max(parent.data[own], 0);
 const int depth = lane < bones ? depths.data[own] : -1, below = lane < bones ? children.data[own] : 0;
@@ -213,7 +287,7 @@ def pass_down_in_warp(
     angular: wp.array2d(dtype=wp.vec3),
     momentum: wp.array2d(dtype=float),
 ):
-    """Run :func:`pass_down` for three velocities in a warp."""
+    """Run :func:`pass_down` for four velocities in a warp."""
     ...
 
 
@@ -234,7 +308,7 @@ def pass_down(
 ):
     """Compute ``J^T m u`` from the momenta of the bones about their joints: each joint sums all bones beyond it.
 
-    A warp does so for three velocities, a single thread for ``velocities`` of them: the first in row ``own``, the
+    A warp does so for four velocities, a single thread for ``velocities`` of them: the first in row ``own``, the
     others ``step`` rows apart.
     """
     sync_threads(threads)

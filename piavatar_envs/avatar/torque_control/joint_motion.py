@@ -11,18 +11,14 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.skinning import blend_steps
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.core.arrays import store_triple, vec8, vec12, vector_at, vector_from
+from piavatar_envs.core.arrays import vec8, vec12
 from piavatar_envs.core.cuda_intrinsics import (
-    BLOCK,
-    first_particle,
     over_ancestors,
     sync_threads,
-    threads_of_environment,
 )
-from piavatar_envs.mpm.types import Kinematic, row
+from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -119,59 +115,6 @@ def blended_motion(b: vec12, arm: wp.vec3):
     :func:`piavatar_envs.avatar.skinning.blend_steps`.
     """
     return wp.vec3(b[0], b[1], b[2]) + wp.cross(wp.vec3(b[3], b[4], b[5]), arm)
-
-
-@wp.kernel(launch_bounds=(BLOCK, 10))
-def split_velocity(
-    body: Body,
-    dt: float,
-    x: wp.array2d(dtype=wp.vec3),
-    pelvis: wp.array(dtype=wp.vec3),
-    steps: wp.array2d(dtype=vec12),
-    failure: wp.array(dtype=int),
-    # in and out
-    u: wp.array2d(dtype=wp.vec3),
-    driven: Kinematic,
-):
-    """Write ``vk = J qdot`` at the midpoint, and set ``u`` to the rest of the total velocity.
-
-    Moved straight by ``J qdot`` of the substep's beginning, a particle that turns by ``theta`` would end
-    ``1 + theta^2 / 2`` times as far from its axis, and limbs would swell without stress. The total velocity is ``u``
-    plus the first of the bones' motions in ``steps``, about the ``pelvis`` joint at the beginning [m]; the second of
-    these is the motion of the joints, about the pelvis joint at the midpoint. ``vk`` also keeps :func:`motion_apart`,
-    stored there by :func:`piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh` for particles of several
-    bones.
-    """
-    i, _ = wp.tid()
-    threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, threads)
-    e = own[0]
-    if failure[e] != 0:
-        return
-    p = own[1]
-    center = pelvis[e]
-    root = steps[e, 0]
-    last = body.count - 1
-    together = body.first + body.alone
-    n = body.first + wp.min(p, last)
-    following = vector_at(x, e, n)
-    following_u = vector_at(u, e, n)
-    following_apart = vector_from(driven.vk, together, e, n)
-    while p < body.count:
-        arm = following - center
-        before = following_u
-        apart = following_apart
-        n = body.first + wp.min(p + threads, last)
-        following = vector_at(x, e, n)
-        following_u = vector_at(u, e, n)
-        following_apart = vector_from(driven.vk, together, e, n)
-        s = blend_steps(steps, e, body.skin, p)
-        whole = before + blended_motion(s, arm)
-        spin = wp.vec3(s[9], s[10], s[11])
-        vk = wp.vec3(s[6], s[7], s[8]) + wp.cross(spin, arm)
-        vk += wp.cross(0.5 * dt * spin, vk - wp.vec3(root[6], root[7], root[8]))
-        store_triple(u, driven.vk, driven.spin, e, body.first + p, whole - vk, vk + apart, spin, True)
-        p += threads
 
 
 @wp.func

@@ -4,10 +4,10 @@ On a GPU an environment has a CUDA block: four warps build the mass matrix, then
 each; one warp runs all other stages, because a launch for a few microseconds of work costs more than the work. On a CPU
 one thread runs a stage.
 
-There are three right-hand sides: momentum of the pull, momentum of the remaining physical velocity, and displacements
-of particles from their places. There are two factors of the mass matrix: one with locked joints and the added inertia
-of the projection, one with locked joints and everything implicit. Those of a kind are in one array: the first of all
-environments, then the second, then the third.
+There are four right-hand sides: momentum of the pull, momentum of the remaining physical velocity, bias forces, and
+displacements of particles from their places. There are two factors of the mass matrix: one with locked joints and the
+added inertia of the projection, one with locked joints and everything implicit. Those of a kind are in one array: the
+first of all environments, then the second, and so on.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from piavatar_envs.avatar.torque_control.bone_contact import TRIPLES, Ground, ad
 from piavatar_envs.avatar.torque_control.joint_momentum import (
     add_change,
     balance,
+    bias_forces,
+    expect_half,
     gather_sums,
     pass_down,
     predict_velocity,
@@ -42,7 +44,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
     load_factor,
     place_of_factor,
     solve,
-    solve_three_in_place,
+    solve_four_in_place,
     store_arena,
     store_factor,
 )
@@ -56,7 +58,7 @@ from piavatar_envs.avatar.torque_control.workspace import (
     view_vectors,
     warp_arena,
 )
-from piavatar_envs.avatar.types import Body
+from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.core.arrays import vec8
 from piavatar_envs.core.cuda_intrinsics import place_in_block, sum_threads, sync_block, sync_threads
 from piavatar_envs.mpm.types import row
@@ -84,19 +86,27 @@ class Support:
 
 
 @wp.func
-def place_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Write the matrices that take the bones from rest to their current places, relative to the pelvis joint."""
+def place_bones(
+    body: Body,
+    pose: Pose,
+    origin: wp.vec3,
+    e: int,
+    thread: int,
+    threads: int,
+    # out
+    place: wp.array2d(dtype=wp.mat44),
+):
+    """Write the matrices that take the bones from rest to their places in ``pose``, relative to ``origin`` [m]."""
     r = row(e, body.rest_joint.shape[0])
-    pelvis = w.pose.position[e, 0]
     for b in range(thread, BONES, threads):
-        w.place[e, b] = rigid_matrix(w.pose.rotation[e, b], body.rest_joint[r, b], w.pose.position[e, b] - pelvis)
+        place[e, b] = rigid_matrix(pose.rotation[e, b], body.rest_joint[r, b], pose.position[e, b] - origin)
 
 
 @wp.func
 def begin(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """Compute motion and places of the bones for the passes over particles."""
     spread_motion(body, w.pose.position, w.velocity, e, e, thread, threads, w.moving)
-    place_bones(body, e, thread, threads, w)
+    place_bones(body, w.pose, w.pose.position[e, 0], e, thread, threads, w.place)
 
 
 @wp.func
@@ -105,11 +115,12 @@ def find_shares(
 ):
     """Solve for the shares ``dq = M^-1 J^T m v`` of several velocities, from the bones' momenta.
 
-    The share of the first velocity is in row ``own``, the others follow ``step`` rows apart.
+    The share of the first velocity is in row ``own``, the others follow ``step`` rows apart: all four in a warp, a
+    single thread passes down ``rows`` of them.
     """
     pass_down(body, w.pose.position, e, rows, own, step, threads, w.linear, w.angular, w.shares)
     load_factor(w.factors, e, arena)
-    solve_three_in_place(w.pattern, w.factors, e, own, step, threads, arena, w.shares)
+    solve_four_in_place(w.pattern, w.factors, e, own, step, threads, arena, w.shares)
 
 
 @wp.func
@@ -129,6 +140,8 @@ def advance_pose(body: Body, dt: float, move: int, off: int, e: int, thread: int
     if move == 1:
         store_motion(w.moving, e, 6, thread, threads, w.steps)
     move_joints(body, time, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
+    if move == 1:
+        place_bones(body, w.pose, w.pelvis[e], e, thread, threads, w.end)
 
 
 @wp.func
@@ -300,7 +313,8 @@ def act(
 ):
     """Project two velocities on the joints (reaction of the pull, then ``u``), apply torques, and advance the pose.
 
-    With three ``moves`` the last one fits the pose; otherwise there are two. Places and motion of the bones are written
+    With three ``moves`` the last one fits the pose; otherwise there are two. The places of the bones before the fit are
+    written for :func:`~piavatar_envs.avatar.torque_control.flesh_coupling.split_velocity`, places and motion after it
     for the next substep. ``per_time`` is the share of an impulse in the support [1/s]. Launched as
     :func:`begin_substep`.
     """
@@ -315,14 +329,17 @@ def act(
     n = failure.shape[0]
     own = row_in_arena(e, 0)
     taken = row_in_arena(n + e, 1)
-    off = row_in_arena(2 * n + e, 2)
+    bias = row_in_arena(2 * n + e, 2)
+    off = row_in_arena(3 * n + e, 3)
     near = load_workspace(w, e)
     gather_sums(
         body.chunk_bone, w.moments, w.other_moments, e, own, taken, off, near.bones, near.linear, near.angular
     )  # fmt: skip
-    find_shares(body, own, taken - own, moves, e, thread, threads, arena, near)
+    bias_forces(body, near.pose.position, near.bones, w.moving, bias, e, thread, threads, near.linear, near.angular)
+    find_shares(body, own, taken - own, moves + 1, e, thread, threads, arena, near)
     pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
+    expect_half(near.shares, bias, dt, e, thread, threads, w.outside)
     apply_torques(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, arena, near)
     predict_velocity(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
     spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.moving)

@@ -28,7 +28,8 @@ MOST_ROWS = 69
 _JOINTS = MOST_ROWS // 3
 #: Words of a warp's arena: all blocks that a factor may have, and three vectors with four words a joint.
 SPARE = 9 * _JOINTS * (_JOINTS + 1) // 2
-ARENA_WORDS = SPARE + 3 * 4 * _JOINTS
+COLUMN = 4 * _JOINTS
+ARENA_WORDS = SPARE + 4 * COLUMN
 _ARENA = """
 float* const arena = reinterpret_cast<float*>(at);
 #if defined(__CUDA_ARCH__)
@@ -196,7 +197,7 @@ def place_of_factor(factor: wp.array2d(dtype=float), f: int, arena: wp.uint64) -
 _TRIPLES = (
     _ARENA
     + f"""
-constexpr int VECTORS = COUNT, STRIDE = {4 * _JOINTS};
+constexpr int VECTORS = COUNT, STRIDE = {COLUMN};
 #if defined(__CUDA_ARCH__)
 float* const spare = arena + {SPARE};
 const auto triple = [&](int v, int n) {{
@@ -305,12 +306,12 @@ def solve_one(
     ...
 
 
-@wp.func_native(_SOLVE.replace("COUNT", "3"))
-def solve_three(
+@wp.func_native(_SOLVE.replace("COUNT", "4"))
+def solve_four(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), down_rounds: int, at: wp.uint64, first: int, step: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """Solve like :func:`solve_one` for three rows, a ``step`` apart."""
+    """Solve like :func:`solve_one` for four rows, a ``step`` apart."""
     ...
 
 
@@ -321,7 +322,7 @@ def descend_three(
 ):  # fmt: skip
     """Multiply three vectors by ``L^-T``; only joints whose bits are ``wanted`` have entries.
 
-    A warp has the vectors in its arena, a single thread in rows of ``x`` as in :func:`solve_three`.
+    A warp has the vectors in its arena, a single thread in rows of ``x`` as in :func:`solve_four`.
     """
     ...
 
@@ -520,7 +521,7 @@ def solve(
 
 
 @wp.func
-def solve_three_in_place(
+def solve_four_in_place(
     pattern: Pattern,
     factor: wp.array2d(dtype=float),
     f: int,
@@ -531,9 +532,9 @@ def solve_three_in_place(
     # in and out
     x: wp.array2d(dtype=float),
 ):
-    """Run :func:`solve` for three right-hand sides in ``x``, from ``first`` on, ``step`` rows apart."""
+    """Run :func:`solve` for four right-hand sides in ``x``, from ``first`` on, ``step`` rows apart."""
     sync_threads(threads)
-    solve_three(pattern.head, pattern.word, pattern.down_rounds, place_of_factor(factor, f, arena), first, step, x)
+    solve_four(pattern.head, pattern.word, pattern.down_rounds, place_of_factor(factor, f, arena), first, step, x)
 
 
 @wp.func

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.torque_control.tree_cholesky import ARENA_WORDS, MOST_ROWS, SPARE, Pattern
+from piavatar_envs.avatar.torque_control.tree_cholesky import ARENA_WORDS, COLUMN, MOST_ROWS, SPARE, Pattern
 from piavatar_envs.avatar.types import Pose
 from piavatar_envs.core.arrays import vec8, vec12, vec16
 
@@ -37,9 +37,10 @@ class TorqueWorkspace:
     # (num_envs, chunks) momenta of the velocity after the pull, and of the displacements to the skinned places
     other_moments: wp.array2d(dtype=vec12)
     bones: wp.array2d(dtype=vec16)  # (num_envs, bones)
-    linear: wp.array2d(dtype=wp.vec3)  # (3 num_envs, bones)
+    linear: wp.array2d(dtype=wp.vec3)  # (4 num_envs, bones)
     angular: wp.array2d(dtype=wp.vec3)
-    # (3 num_envs, 69) momenta, then velocity changes by the joints and by the projection, and the fit of the pose
+    # (4 num_envs, 69) momenta, then velocity changes by the joints and by the projection, the change of ``qdot`` by
+    # the bias forces, and the fit of the pose
     shares: wp.array2d(dtype=float)
     # (3 num_envs, 69) columns J^T, then Y, of the point of a bone, an axis each; used on a CPU only
     touch: wp.array2d(dtype=float)
@@ -56,22 +57,24 @@ class TorqueWorkspace:
     moving: wp.array2d(dtype=vec8)  # (num_envs, bones) rigid motions by the joints
     # (num_envs, bones) rigid motions: total velocity less physical one, and J qdot at the midpoint
     steps: wp.array2d(dtype=vec12)
+    # (num_envs, bones) from rest to the places at the end of a substep, relative to the pelvis at its beginning
+    end: wp.array2d(dtype=wp.mat44)
     slip: wp.array2d(dtype=wp.vec3)  # as in JointState
     pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) position of its joint at the start of the substep [m]
 
 
-# Words of a warp's arena: the factor, whose place first holds the bones' momenta; three shares, the bones'
+# Words of a warp's arena: the factor, whose place first holds the bones' momenta; four shares, the bones'
 # motion, and the pose.
 _ROWS, _VECTORS = wp.constant(MOST_ROWS), wp.constant(3 * NUM_JOINTS)
 _LINEAR = wp.constant(0)
-_ANGULAR = wp.constant(int(_LINEAR) + 3 * int(_VECTORS))
+_ANGULAR = wp.constant(int(_LINEAR) + 4 * int(_VECTORS))
 _SHARES = wp.constant(ARENA_WORDS)
-_MOVING = wp.constant(int(_SHARES) + 3 * MOST_ROWS)
+_MOVING = wp.constant(-(-(int(_SHARES) + 4 * MOST_ROWS) // 4) * 4)
 _ROTATION = wp.constant(int(_MOVING) + 8 * NUM_JOINTS)
 _POSITION = wp.constant(int(_ROTATION) + 4 * NUM_JOINTS)
 _WORDS = -(-(int(_POSITION) + 3 * NUM_JOINTS) // 4) * 4
 # First word of the right-hand sides in an arena, and words of each.
-_SPARE, _COLUMN = wp.constant(SPARE), wp.constant((ARENA_WORDS - SPARE) // 3)
+_SPARE, _COLUMN = wp.constant(SPARE), wp.constant(COLUMN)
 
 
 @wp.func_native(f"""
