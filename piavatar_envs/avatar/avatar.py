@@ -53,7 +53,7 @@ class Avatar:
         self.model, self.num_points, self.threads = model, points.num_points, warp_threads(device)
         self.body = build_body(points, first, device)
         self.body_mass = wp.array(points.mass.sum(1).astype(np.float32), dtype=float, device=device)
-        self.state: AvatarState = allocate(AvatarState, n, device, motion=points.num_points)
+        self.state: AvatarState = allocate(AvatarState, n, device)
         self.tracked: Tracked = allocate(Tracked, n, device)
         self.placed = allocate(Pose, n, device)
         for rotation in (self.state.command_rotation, self.state.goal_rotation, self.tracked.rotation):
@@ -102,7 +102,7 @@ class Avatar:
             place_particles,
             n * self.num_points,
             [mask, self.body, self._bone_from],
-            [state.x, state.u, state.C, state.F, state.kinematic, s.motion, state.failure],
+            [state.x, state.u, state.C, state.F, state.kinematic, state.failure],
         )
 
     def record_set_in_motion(self, graph: LaunchGraph, state: State, mask: wp.array, after: Pose) -> None:
@@ -165,7 +165,6 @@ def place_particles(
     C: wp.array3d(dtype=float),
     F: wp.array3d(dtype=float),
     kinematic: Kinematic,
-    motion: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
 ):
     """Place the particles of the masked environments in the pose ``bone_from``, and clear their failures."""
@@ -179,7 +178,6 @@ def place_particles(
     u[e, q] = wp.vec3(0.0)
     kinematic.vk[e, q] = wp.vec3(0.0)
     kinematic.spin[e, q] = wp.vec3(0.0)
-    motion[e, p] = wp.vec3(0.0)
     store_matrix(C, e, q, wp.mat33())
     store_matrix(F, e, q, wp.identity(n=3, dtype=float))
     failure[e] = 0
@@ -201,6 +199,14 @@ def set_in_motion(
         return
     q = body.first + p
     u[e, q] = (skinned_place(body, bone_after, e, p) - x[e, q]) / time
+
+
+@wp.kernel
+def reset_vectors(mask: wp.array(dtype=wp.bool), v: wp.array2d(dtype=wp.vec3)):
+    """Zero the vectors of the masked environments."""
+    e, p = wp.tid()
+    if mask[e]:
+        v[e, p] = wp.vec3(0.0)
 
 
 @wp.kernel

@@ -209,9 +209,6 @@ class AvatarState:
     goal_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local rotations at the end of this control step
     goal_root: wp.array(dtype=wp.vec3)  # (num_envs,) pelvis position to reach [m]
     released: wp.array(dtype=int)  # (num_envs,) 1 once the root is no longer held
-    # (num_envs, count) kinematic velocity in the last substep of flesh with a velocity lag, before its rigid part is
-    # taken out [m/s]; zero elsewhere, so under torque control everywhere
-    motion: wp.array2d(dtype=wp.vec3)
     wrench_force: wp.array(dtype=wp.vec3)  # (num_envs,) mean force on the root in the last control step [N]
     wrench_torque: wp.array(dtype=wp.vec3)  # (num_envs,) mean torque on it [N m]
 

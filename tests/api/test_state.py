@@ -106,7 +106,7 @@ def with_infinity(array):
         (replaced("env.step_count", lambda count: np.zeros(2, np.int32)), r"env.step_count.*\(2,\).*\(1,\)"),
         (replaced("particles.u", lambda u: u.astype(np.float64)), "particles.u.*float64.*float32"),
         (replaced("avatar_0.tracked.rotation", lambda q: q.astype(str)), "avatar_0.tracked.rotation"),
-        (replaced("avatar_0.state.motion", with_infinity), r"avatar_0.state.motion.*inf"),
+        (replaced("controller_0.motion", with_infinity), r"controller_0.motion.*inf"),
         (lambda state: {}, "missing"),
         (lambda state: None, "NoneType.*get_state"),
         (lambda state: [1, 2], "list.*get_state"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.avatar import Avatar
+from piavatar_envs.avatar.avatar import Avatar, reset_vectors
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.pose_control.bones import begin_control, end_control
 from piavatar_envs.avatar.pose_control.injection import bone_matrices, inject_velocity
@@ -39,6 +39,8 @@ class PoseController:
         avatar: the avatar.
         parameters: settings of the control, in the form of the kernels.
         workspace: arrays of a substep, with the order of the kinematic poses in even substeps.
+        motion: kinematic velocity in the last substep of flesh with a velocity lag, before its rigid part was taken
+            out, ``(num_envs, num_points)`` [m/s]; stored in checkpoints, except where velocity is injected.
         in_one_launch: whether one launch runs all stages before a substep, as on a CPU.
     """
 
@@ -79,6 +81,7 @@ class PoseController:
             pull=avatar.num_points,
             lean=avatar.num_points,
         )
+        self.motion = wp.zeros((n, avatar.num_points), dtype=wp.vec3, device=model.device)
         w = self.workspace
         swapped = {name: getattr(w, name) for name in PoseWorkspace.vars} | {"now": w.after, "after": w.now}
         self._workspaces = w, make_struct(PoseWorkspace, **swapped)
@@ -87,7 +90,8 @@ class PoseController:
         self._bone_from, self._bone_step = (wp.zeros(matrices, dtype=wp.mat44, device=model.device) for _ in range(2))
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
-        """Append nothing: a control step begins from the tracked pose."""
+        """Append the reset of the masked environments' :attr:`motion`; a control step begins from the tracked pose."""
+        graph.launch(reset_vectors, self.motion.shape, [mask], [self.motion])
 
     def record_begin(self, graph: LaunchGraph) -> None:
         """Append the start of a control step: the increments from the tracked pose towards the goal."""
@@ -109,7 +113,7 @@ class PoseController:
         elif self.in_one_launch:
             avatar, particles = self.avatar, self.avatar.model.particles
             inputs = [avatar.body, self.parameters, particles, avatar.body_mass, step, state.x, state.failure]
-            outputs = [self._workspaces[step % 2], self._root, avatar.state.motion, state.u, state.kinematic]
+            outputs = [self._workspaces[step % 2], self._root, self.motion, state.u, state.kinematic]
             graph.launch(command_body, avatar.model.num_envs, inputs, outputs)
         else:
             self._record_passes(graph, state, step)
@@ -133,7 +137,7 @@ class PoseController:
         graph.launch(prepare_body, (n, block), inputs, [w, root], block_dim=block)
 
         inputs = [body, parameters, state.x, w.record, w.bones, released, failure]
-        outputs = [state.u, avatar.state.motion, state.kinematic, w.pull, w.lean]
+        outputs = [state.u, self.motion, state.kinematic, w.pull, w.lean]
         graph.launch(command_particles, points, inputs, outputs, block_dim=BLOCK)
         if parameters.free_motion or parameters.root_rate > 0.0:  # a released root leaves an unsupported body
             inputs = [body, parameters, particles, state.x, state.vk, w.bones.center, released, failure, threads]
@@ -169,5 +173,5 @@ class PoseController:
         )
 
     def arrays(self) -> dict[str, wp.array]:
-        """Return no arrays: everything that a control step starts from is the avatar's."""
-        return {}
+        """Return the arrays of a checkpoint, by name."""
+        return {} if self._injects else {"motion": self.motion}

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.avatar import Avatar
+from piavatar_envs.avatar.avatar import Avatar, reset_vectors
 from piavatar_envs.avatar.body.device import BodyPoints
 from piavatar_envs.avatar.body.muscles import (
     FASTEST,
@@ -159,14 +159,6 @@ def set_joints_in_motion(
     set_triple(velocity, e, 3 + 3 * b, spin)
 
 
-@wp.kernel
-def clear_slip(mask: wp.array(dtype=wp.bool), slip: wp.array2d(dtype=wp.vec3)):
-    """Clear the slip of the particles of the masked environments."""
-    e, p = wp.tid()
-    if mask[e]:
-        slip[e, p] = wp.vec3(0.0)
-
-
 class TorqueController:
     """Controller that applies torques between the bones of one avatar in every environment.
 
@@ -244,7 +236,7 @@ class TorqueController:
         n, placed = avatar.model.num_envs, avatar.placed
         outputs = [s.rotation, s.position, s.torque, s.velocity, s.outside]
         graph.launch(reset_joints, (n, 1 + NUM_JOINTS), [mask, placed.rotation, placed.position], outputs)
-        graph.launch(clear_slip, s.slip.shape, [mask], [s.slip])
+        graph.launch(reset_vectors, s.slip.shape, [mask], [s.slip])
         if self.first:
             avatar.record_still_pose(graph, self.first, self._first_pose)
             avatar.record_set_in_motion(graph, state, mask, self._first_pose)
