@@ -142,7 +142,7 @@ class Stage:
         self._reset, self._step = LaunchGraph(self.simulation.device), LaunchGraph(self.simulation.device)
         everyone = wp.array([True], dtype=wp.bool, device=self.simulation.device)
         self.simulation.record_reset(self._reset, everyone)
-        self.simulation.record_control_step(self._step)
+        self.simulation.record_step(self._step)
         self._command("command", act.script(0.0))
         self._reset.run()
 

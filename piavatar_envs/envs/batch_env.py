@@ -80,7 +80,7 @@ class BatchEnv(EpisodeArrays):
             task.domain(),
             task.scene,
             avatar_names=task.agent_names,
-            impulses=task.impulses(),
+            largest_impulses=task.impulses(),
         )
         places = simulation.props.points, task.prop_places()
         check_places(simulation.domain, simulation.dx, task.scene.props, *places)
@@ -190,7 +190,7 @@ class BatchEnv(EpisodeArrays):
             self._record_actions(graph, agent, avatar, reference)
             if self.num_agents > 1:
                 graph.launch(retire, n, [agent, self.alive], [avatar.state.released])
-        sim.record_control_step(graph)
+        sim.record_step(graph)
         self.task.record_outcome(self, graph)
         for agent, avatar in enumerate(sim.avatars):
             graph.launch(

@@ -7,7 +7,7 @@ nodes' total velocity.
 ``model.path`` names the path of P2G and G2P. ``"plain"`` runs on CPUs, and on GPUs below compute capability 7.0.
 ``"tiled"`` sums tiles of particles of large bodies in shared memory before they reach the grid. ``"block"`` keeps the
 grid of an environment in the shared memory of CUDA blocks, so that P2G, the grid update and, with a single velocity
-field, G2P are one launch.
+field, G2P are one launch (:func:`record_block_substep`).
 """
 
 from __future__ import annotations
@@ -52,14 +52,15 @@ def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scra
     The physical velocity, position and deformation in ``state`` advance by ``model.step.dt`` under the kinematic
     velocity ``state.vk``; contact is added to the sensors.
     """
-    world = (model, state, scratch)
-    if index == 0 and model.path == "block":
-        graph.launch(reset_speeds, scratch.arena.speed.shape, [scratch.arena])
+    simulated = (model, state, scratch)
     if index > 0 and index % model.activation_interval == 0:
-        record_activation(graph, *world)
-    record_p2g(graph, *world)
-    record_grid_update(graph, *world)
-    record_g2p(graph, *world)
+        record_activation(graph, *simulated)
+    if model.path == "block":
+        record_block_substep(graph, *simulated, first=index == 0)
+    else:
+        record_p2g(graph, *simulated)
+        record_grid_update(graph, *simulated)
+        record_g2p(graph, *simulated)
     if model.moving_boundaries:
         graph.launch(move_colliders, model.boundaries.position.shape, [model.step.dt], [model.boundaries])
 
@@ -81,11 +82,8 @@ def record_activation(graph: LaunchGraph, model: Model, state: State, scratch: S
 
 def record_p2g(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append P2G: particles add mass, physical and kinematic momentum to the nodes around them."""
-    m, moving = model, _moving(state)
-    if m.path == "block":  # includes the grid update, and G2P if there is a single field
-        record_in_block(graph, model, state, scratch, moving)
-        return
-    inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, moving, scratch.blocks]
+    m = model
+    inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, _moving(state), scratch.blocks]
     outputs = [state.failure, scratch.accumulators]
     if m.path == "plain":
         graph.launch(p2g, state.x.shape, inputs, outputs)
@@ -102,16 +100,21 @@ def record_grid_update(graph: LaunchGraph, model: Model, state: State, scratch: 
     contact, update = LaunchGraph(graph.device), LaunchGraph(graph.device)
     if m.contact.num_fields > 1:
         _record_contact(contact, model, state, scratch)
-    if m.path != "block":  # else included in P2G
-        active_blocks = blocks_at_once(m)
-        update.launch(
-            update_grid,
-            m.num_envs * active_blocks * threads_per_active_block(m),
-            [m.grid, m.step, m.boundaries, m.contact, active_blocks, state.failure],
-            [scratch.blocks, scratch.accumulators, scratch.velocity, scratch.sensors],
-            block_dim=THREADS,
-        )
+    active_blocks = blocks_at_once(m)
+    update.launch(
+        update_grid,
+        m.num_envs * active_blocks * threads_per_active_block(m),
+        [m.grid, m.step, m.boundaries, m.contact, active_blocks, state.failure],
+        [scratch.blocks, scratch.accumulators, scratch.velocity, scratch.sensors],
+        block_dim=THREADS,
+    )
     graph.parallel(contact, update)
+    _record_contact_sensors(graph, model, state, scratch)
+
+
+def _record_contact_sensors(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
+    """Append the impulses and penetration of body parts, unless G2P reads them."""
+    m = model
     if m.contact.num_fields > 1 and m.num_sensors > 0 and not senses_in_g2p(m):
         graph.launch(
             sense_contact,
@@ -145,8 +148,6 @@ def _record_contact(graph: LaunchGraph, model: Model, state: State, scratch: Scr
 def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append G2P: particles take velocity and its gradient from the nodes, move, and update ``F``."""
     m = model
-    if m.path == "block" and m.contact.num_fields == 1:
-        return  # included in P2G
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
     outputs = [scratch.blocks, _moving(state), state.failure]
     if m.path == "plain":
@@ -159,6 +160,21 @@ def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch)
             [*outputs, scratch.sensors],
             block_dim=G2P_THREADS,
         )
+
+
+def record_block_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scratch, first: bool) -> None:
+    """Append the three stages on the path ``"block"``; ``first`` in the control step, it resets the speeds.
+
+    One launch has P2G, the grid update and, with a single velocity field, G2P. Contact between fields needs all of
+    them, so with several fields it follows, and G2P after it.
+    """
+    if first:
+        graph.launch(reset_speeds, scratch.arena.speed.shape, [scratch.arena])
+    record_in_block(graph, model, state, scratch, _moving(state))
+    if model.contact.num_fields > 1:
+        _record_contact(graph, model, state, scratch)
+        _record_contact_sensors(graph, model, state, scratch)
+        record_g2p(graph, model, state, scratch)
 
 
 def _moving(state: State) -> Moving:

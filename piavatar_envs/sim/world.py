@@ -70,7 +70,7 @@ class Simulation:
         scene: SceneConfig | None = None,
         avatar_names: Sequence[str] | None = None,
         asset: AvatarAsset | None = None,
-        impulses: Mapping[str, float] | None = None,
+        largest_impulses: Mapping[str, float] | None = None,
     ) -> None:
         """Build and allocate a world; nothing is placed until the first reset.
 
@@ -82,7 +82,7 @@ class Simulation:
             scene: avatars, props and colliders; those of ``config`` if not given.
             avatar_names: names of the avatars; ``agent_0`` ... if not given.
             asset: the body of all avatars; those of their sources if not given.
-            impulses: the greatest impulse on each bone [N s], by joint.
+            largest_impulses: on each bone [N s], by joint.
 
         Raises:
             ConfigError: an impossible scene.
@@ -92,9 +92,9 @@ class Simulation:
         self.scene = scene or config.scene
         self._load_bodies(asset)
         self._build_matter()
-        walls = self._bound(domain)
+        walls = self._set_domain(domain)
         self._assemble(avatar_names, walls)
-        self._build_model(impulses or {})
+        self._build_model(largest_impulses or {})
         self.state, self.scratch = allocate(self.model)
         self.sensors = self.scratch.sensors
         self._build_avatars()
@@ -130,7 +130,7 @@ class Simulation:
             prop_matter(prop, points, physics) for prop, points in zip(self.scene.props, self._solids, strict=True)
         ]
 
-    def _bound(self, domain: Domain | None) -> tuple[Collider, ...]:
+    def _set_domain(self, domain: Domain | None) -> tuple[Collider, ...]:
         """Set the domain, wider for bodies under torque control, and return the walls around it.
 
         Raises:
@@ -140,7 +140,7 @@ class Simulation:
         domain = domain or Domain().around([avatar.position for avatar in self._avatar_configs])
         walled = self.scene.walls and (bool(solids) or len(self.flesh) > 1 or domain.fenced)
         self.domain = domain.for_falls(walled) if any(self._torque) else domain
-        # a task places its own props at every reset
+        # a task places its own props at every reset, so that only those of the settings are checked
         configured = {prop.name for prop in self.config.scene.props}
         given = [(prop, points) for prop, points in zip(props, solids, strict=True) if prop.name in configured]
         check_apart(self.dx, [prop for prop, _ in given], [points for _, points in given])
@@ -155,7 +155,7 @@ class Simulation:
         rows = self.num_envs if differs else 1
         self.subjects = assemble(self.scene, self.config.physics, names, self.flesh, self._prop_matter, walls, rows)
 
-    def _build_model(self, impulses: Mapping[str, float]) -> None:
+    def _build_model(self, largest_impulses: Mapping[str, float]) -> None:
         """Choose the time step and upload the constants of the continuum."""
         config, physics, subjects = self.config, self.config.physics, self.subjects
         rest = np.concatenate(
@@ -170,7 +170,7 @@ class Simulation:
             device=self.device,
             control_dt=physics.control_dt,
             num_substeps=choose_substeps(
-                config, self.scene, self.domain, self.flesh, self._solids, impulses, self.dx, fastest
+                config, self.scene, self.domain, self.flesh, self._solids, largest_impulses, self.dx, fastest
             ),
             cfl=physics.cfl,
             gravity=(0.0, 0.0, -physics.gravity),
@@ -222,10 +222,9 @@ class Simulation:
         graph.parallel_for_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
         self.props.record_tracking(graph, self.state)
 
-    def record_control_step(self, graph: LaunchGraph) -> None:
-        """Record a control step towards the avatars' goals, after which avatars and props are tracked."""
-        record_control_step(graph, self.avatars, self.controllers, self.model, self.state, self.scratch)
-        self.props.record_tracking(graph, self.state)
+    def record_step(self, graph: LaunchGraph) -> None:
+        """Append a control step towards the avatars' goals; see :func:`record_control_step`."""
+        record_control_step(graph, self.avatars, self.controllers, self.model, self.state, self.scratch, self.props)
 
     def arrays(self) -> dict[str, wp.array]:
         """Return all arrays of a checkpoint by name."""
@@ -249,30 +248,33 @@ def record_control_step(
     model: Model,
     state: State,
     scratch: Scratch,
+    props: PropSet | None = None,
 ) -> None:
-    """Append one control step of a world, after which its avatars are tracked.
+    """Append one control step, after which avatars and props are tracked.
 
     Controllers of different avatars run in parallel: none reads what another one writes.
     """
-    world = (model, state, scratch)
+    simulated = (model, state, scratch)
     begins = graph.branches(controllers, lambda controller, own: controller.record_begin(own))
-    record_begin(graph, *world, branches=begins)  # activates blocks
+    record_begin(graph, *simulated, branches=begins)  # activates blocks
     for step in range(model.num_substeps):
         graph.parallel_for_each(
             controllers, lambda c, own, step=step: c.record_before_substep(own, state, scratch, step)
         )
-        record_substep(graph, *world, step)
+        record_substep(graph, *simulated, step)
 
     def end(index: int, own: LaunchGraph) -> None:
         controllers[index].record_end(own, state)
         avatars[index].record_tracking(own, state)
 
     ends = graph.branches(range(len(avatars)), end)
-    # sensors read the particles where the substeps have left them
-    in_order = any(controller.moves_particles for controller in controllers)
-    record_end(graph, *world, branches=() if in_order else ends)
-    if in_order:
+    # sensors are read before a controller moves particles
+    sensors_first = any(controller.moves_particles for controller in controllers)
+    record_end(graph, *simulated, branches=() if sensors_first else ends)
+    if sensors_first:
         graph.parallel(*ends)
+    if props:
+        props.record_tracking(graph, state)
 
 
 def check_device(device: str) -> str:

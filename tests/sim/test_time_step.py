@@ -39,7 +39,7 @@ def test_no_default_has_other_substeps_than_its_waves_ask_for(device):
         fidelity = "tiny" if load_config(cls.Config).control.mode == "pose" else "coarse"
         task = cls(load_config(cls.Config, None, {"fidelity": fidelity}))
         world_of = task.config, 1, device, task.domain(), task.scene
-        simulation = Simulation(*world_of, avatar_names=task.agent_names, impulses=task.impulses())
+        simulation = Simulation(*world_of, avatar_names=task.agent_names, largest_impulses=task.impulses())
         model, physics = simulation.model, task.config.physics
         wave = choose_num_substeps(physics.control_dt, simulation.dx, model.sound_speed, physics.cfl)
         assert model.num_substeps == wave, cls.__name__
