@@ -23,9 +23,20 @@ from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
-#: Bounds of the course: azimuth to either side, elevation, share of the speed, a whole turn [rad]; its middle.
-SIDE, BELOW, ABOVE = wp.constant(1.6), wp.constant(-0.7), wp.constant(0.9)
-SLOWEST, TURN, CHEST = wp.constant(0.3), wp.constant(6.2831853), wp.constant(joint_index("spine3"))
+#: Greatest azimuth of the swing's middle to either side [rad].
+SIDE = wp.constant(1.6)
+#: Least elevation of the swing's middle [rad].
+BELOW = wp.constant(-0.7)
+#: Greatest elevation of the swing's middle [rad].
+ABOVE = wp.constant(0.9)
+#: Least bound of the target's speed over `target_speed` [-].
+SLOWEST = wp.constant(0.3)
+#: A whole turn [rad].
+TURN = wp.constant(6.2831853)
+#: Joint at the centre of the target's sphere.
+CHEST = wp.constant(joint_index("spine3"))
+#: Columns of ``outcome.terms``, in the order of ``ReachTask.rewards``.
+TERM_REACH, TERM_CONTROL = map(wp.constant, range(2))
 COURSE = (
     Parameter("target_azimuth", "rad", -SIDE, SIDE, "middle of the swing, from the front"),
     Parameter("target_elevation", "rad", BELOW, ABOVE, "middle of the swing, upwards"),
@@ -71,7 +82,11 @@ class Swing:
 
 
 @wp.kernel
-def draw_target(episodes: Episodes, swing: Swing):
+def draw_target(
+    episodes: Episodes,
+    # out
+    swing: Swing,
+):
     """Draw course and phase in the masked environments."""
     e = wp.tid()
     if episodes.mask[e]:
@@ -94,16 +109,22 @@ def goal_at(target: Target, swing: Swing, bones: Bones, e: int, time: float):
 
 @wp.kernel
 def judge(
-    target: Target, swing: Swing, bones: Bones, episodes: Episodes, action: wp.array3d(dtype=float), outcome: Outcome
+    target: Target,
+    swing: Swing,
+    bones: Bones,
+    episodes: Episodes,
+    action: wp.array3d(dtype=float),
+    # out
+    outcome: Outcome,
 ):
-    """Reward the nearer hand. The step counter has not moved yet: the state is one step ahead of it."""
+    """Reward the nearer hand. `step_count` is incremented after the outcome: the state is one step ahead of it."""
     e = wp.tid()
     goal = goal_at(target, swing, bones, e, target.control_dt * float(episodes.step_count[e] + 1))
     left = wp.length(flesh_middle(bones, e, LEFT_WRIST) - goal)
     right = wp.length(flesh_middle(bones, e, RIGHT_WRIST) - goal)
     distance = wp.min(left, right)
-    outcome.terms[e, 0, 0] = tolerance(distance, target.target_radius, target.margin)
-    outcome.terms[e, 0, 1] = -target.control_cost * mean_square_action(action, e, 0)
+    outcome.terms[e, 0, TERM_REACH] = tolerance(distance, target.target_radius, target.margin)
+    outcome.terms[e, 0, TERM_CONTROL] = -target.control_cost * mean_square_action(action, e, 0)
     outcome.metrics[e, 0, 0] = distance
     outcome.metrics[e, 0, 1] = left
     outcome.metrics[e, 0, 2] = right
@@ -112,18 +133,25 @@ def judge(
 
 @wp.kernel
 def observe(
-    target: Target, swing: Swing, bones: Bones, episodes: Episodes, start: int, observation: wp.array3d(dtype=float)
+    target: Target,
+    swing: Swing,
+    bones: Bones,
+    episodes: Episodes,
+    agent: int,
+    start: int,
+    # out
+    observation: wp.array3d(dtype=float),
 ):
     """Write the target's position, and ``ReachTask.observation_terms`` from component ``start``."""
     e = wp.tid()
     time = target.control_dt * float(episodes.step_count[e])
     here = goal_at(target, swing, bones, e, time)
-    next = goal_at(target, swing, bones, e, time + target.control_dt)
+    later = goal_at(target, swing, bones, e, time + target.control_dt)
     swing.goal[e] = here
-    write_in_root(observation, e, 0, start, bones, here - bones.position[e, 0])
-    write_in_root(observation, e, 0, start + 3, bones, (next - here) / target.control_dt)
-    write_in_root(observation, e, 0, start + 6, bones, here - flesh_middle(bones, e, LEFT_WRIST))
-    write_in_root(observation, e, 0, start + 9, bones, here - flesh_middle(bones, e, RIGHT_WRIST))
+    write_in_root(observation, e, agent, start, bones, here - bones.position[e, 0])
+    write_in_root(observation, e, agent, start + 3, bones, (later - here) / target.control_dt)
+    write_in_root(observation, e, agent, start + 6, bones, here - flesh_middle(bones, e, LEFT_WRIST))
+    write_in_root(observation, e, agent, start + 9, bones, here - flesh_middle(bones, e, RIGHT_WRIST))
 
 
 class ReachTask(Task):
@@ -170,7 +198,7 @@ the middle of either hand to the target and stays with it."""
         graph.launch(judge, env.num_envs, [*self.inputs, env.action], [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        graph.launch(observe, env.num_envs, [*self.inputs, start], [env.observation])
+        graph.launch(observe, env.num_envs, [*self.inputs, agent, start], [env.observation])
 
     def markers(self, env, index: int) -> list:
         return [(self.goal.numpy()[index].copy(), self.config.target_radius, (0.95, 0.35, 0.2))]

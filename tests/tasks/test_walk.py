@@ -103,20 +103,20 @@ def test_leaving_the_way_is_the_end(make_env, velocity):
     assert terminated and 5 < steps < 14
 
 
-@pytest.mark.parametrize("most_behind", [0.2, None])
-def test_falling_behind_the_pace_is_the_end(make_env, most_behind):
+@pytest.mark.parametrize("max_lag", [0.2, None])
+def test_falling_behind_the_pace_is_the_end(make_env, max_lag):
     """Of a body that stands: by 0.9 of the target's speed it is 0.2 m behind after 0.22 s, and not out without."""
-    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, most_behind=most_behind)
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, max_lag=max_lag)
     env.reset(seed=0)
     ends = []
     for step in range(12):
         _, _, terminated, _, info = env.step(still(env))
         behind = 0.9 * (step + 1) * env.config.physics.control_dt - info["distance"]
-        assert terminated == (most_behind is not None and behind > most_behind)
+        assert terminated == (max_lag is not None and behind > max_lag)
         ends.append(terminated)
         if terminated:
             break
-    assert len(ends) == (12 if most_behind is None else 7)
+    assert len(ends) == (12 if max_lag is None else 7)
 
 
 def due(time: float, stride: float) -> float:
@@ -132,13 +132,13 @@ def stepped(lead: float, time: float, stride: float, length: float) -> float:
 @pytest.mark.parametrize(("stride", "speed", "yaw"), [(1.0, 1.0, 0.0), (0.7, 1.6, 2.0)])
 def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride, speed, yaw):
     """A body that leans on one foot and then on the other: the reward is that of its load, its step and of the time."""
-    settings = {"gait.worth": 0.3, "gait.stride_seconds": stride, "scene.avatars": [{"yaw": yaw}]}
+    settings = {"gait.weight": 0.3, "gait.stride_seconds": stride, "scene.avatars": [{"yaw": yaw}]}
     env = make_env(WALK, root_assist=0.3, pose_noise=0.0, target_speed=speed, **settings)
     observation, _ = env.reset(seed=0)
     assert seen(env, observation, "gait_phase") == pytest.approx([0.0, 1.0])
     ahead = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     paid, dt, sim = [], env.config.physics.control_dt, env.batch.simulation
-    rest, soles = sim.flesh[0].points.rest[0], env.batch.task.way.gait.soles.numpy()
+    rest, soles = sim.flesh[0].points.rest[0], env.batch.task.path.gait.soles.numpy()
     for step in range(60):
         action = still(env)
         for name in ("spine1.y", "spine2.y", "spine3.y"):
@@ -166,7 +166,7 @@ def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride, speed, yaw)
 
 
 def test_feet_in_the_air_are_not_in_turn(make_env):
-    env = make_env(WALK, gravity=0.0, pose_noise=0.0, ground=False, **{"gait.worth": 0.3})
+    env = make_env(WALK, gravity=0.0, pose_noise=0.0, ground=False, **{"gait.weight": 0.3})
     for terms in gait_terms(env, 5):
         assert terms["gait"] == 0.0 and terms["speed"] == pytest.approx(0.4 * tolerance(1.0, 0.1, 1.0), abs=5e-3)
 
@@ -174,7 +174,7 @@ def test_feet_in_the_air_are_not_in_turn(make_env):
 @pytest.mark.parametrize("swing", [0.3, 0.0])
 def test_arms_hang_and_swing_against_the_legs(make_env, swing):
     """Held joints follow the reference: the left hand is in front when the clock has the right foot there."""
-    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **{"gait.worth": 0.3, "gait.arm_swing": swing})
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **{"gait.weight": 0.3, "gait.arm_swing": swing})
     env.reset(seed=0)
     ahead = []
     for _ in range(60):
@@ -193,7 +193,7 @@ def test_arms_hang_and_swing_against_the_legs(make_env, swing):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"root_assist": 1.0, "gait.worth": 0.0}, {"control": "pose"}], ids=["no gait", "commanded"]
+    "settings", [{"root_assist": 1.0, "gait.weight": 0.0}, {"control": "pose"}], ids=["no gait", "commanded"]
 )
 def test_arms_do_not_swing_without_a_gait_or_under_commands(make_env, settings):
     """A commanded body is paid by the clock as others are, and stays in the pose that it is in."""
@@ -212,7 +212,7 @@ def test_arms_do_not_swing_without_a_gait_or_under_commands(make_env, settings):
 def test_every_environment_has_a_clock_of_its_own(device):
     """Goals of held arms follow the clock of each environment, which a partial reset sets back."""
     legs = ["left_hip", "right_hip", "left_knee", "right_knee"]
-    settings = {"control": "torque", "fidelity": "tiny", "joints": legs, "root_assist": 1.0, "gait.worth": 0.2}
+    settings = {"control": "torque", "fidelity": "tiny", "joints": legs, "root_assist": 1.0, "gait.weight": 0.2}
     task = load_task(WALK)
     batch = BatchEnv(task(load_config(task.Config, settings)), 3, device)
     batch.reset(seeds=[0, 1, 2])
@@ -242,7 +242,7 @@ def test_every_environment_has_a_clock_of_its_own(device):
         ({"gait.stride_seconds": 0.19}, "stride_seconds"),
         ({"gait.stride_seconds": 2.0, "target_speed": 1.2}, None),
         ({"gait.stride_seconds": 2.0, "target_speed": 1.3}, r"1\.3 m.* 1\.85 s"),
-        ({"gait.stride_seconds": 2.0, "target_speed": 1.3, "gait.worth": 0.0}, None),
+        ({"gait.stride_seconds": 2.0, "target_speed": 1.3, "gait.weight": 0.0}, None),
         ({"gait.stride_seconds": 0.4, "target_speed": 5.0}, None),
     ],
 )
@@ -258,7 +258,7 @@ def test_strides_of_hardly_any_steps_and_steps_that_no_leg_makes_are_refused(set
 
 def test_the_mirror_is_half_a_stride_on(make_env):
     """The reward of the left foot's load is, mirrored, that of the right one's at the same moment."""
-    env = make_env(WALK, **{"gait.worth": 0.3})
+    env = make_env(WALK, **{"gait.weight": 0.3})
     terms = [env.observation_layout["gait_phase"], env.observation_layout["foot_impulses"]]
     mirror = Mirror(terms, ("left_hip", "right_hip"), "cpu")
     time = 0.13

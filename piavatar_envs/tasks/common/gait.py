@@ -39,9 +39,9 @@ GAIT_TERM = ObservationTerm(
     "gait_phase", 2, "-", "-", "sine and cosine of the gait clock: while the sine is positive the left foot bears"
 )
 #: Error of the left foot's share of the load without a loss of reward, and the further error that leaves a tenth [-].
-_BOUND, _MARGIN = 0.2, 0.4
+_LOAD_BOUND, _LOAD_MARGIN = 0.2, 0.4
 #: The same for its lead on the right foot, in lengths of a step [-].
-_SHORT, _SHORT_MARGIN = 0.2, 0.6
+_LEAD_BOUND, _LEAD_MARGIN = 0.2, 0.6
 #: Greatest distance between the ankles of an adult [m].
 _REACH = 1.2
 #: Share of a stride in which the load goes from one foot to the other: adults have 0.1, twice a stride (Perry &
@@ -51,13 +51,14 @@ _HANDOVER = 0.1
 _LEAST_STEPS = 6.0
 GAIT_REWARD = Term(
     "gait",
-    f"`gait.worth` while the left foot's share of the ground's load is within {_BOUND} of the clock's: 1 in the first "
-    f"half of every `gait.stride_seconds`, 0 in the second, with {_HANDOVER} of a stride for each transition; beyond "
-    f"it a Gaussian that has fallen to a tenth after another {_MARGIN}; nothing while neither foot bears. Half of the "
-    "reward is for the load alone. The other half is multiplied by a factor that is 1 while the left ankle's lead on "
-    f"the right one is within {_SHORT} of a step's length, `target_speed * gait.stride_seconds / 2`, of that length "
-    "times the cosine of the clock's phase; beyond it a Gaussian that has fallen to a tenth after another "
-    f"{_SHORT_MARGIN}. All times `height` / 0.1, and less where the pelvis tilts, as `upright` is where the chest does",
+    f"`gait.weight` while the left foot's share of the ground's load is within {_LOAD_BOUND} of the clock's: 1 in the "
+    f"first half of every `gait.stride_seconds`, 0 in the second, with {_HANDOVER} of a stride for each transition; "
+    f"beyond it a Gaussian that has fallen to a tenth after another {_LOAD_MARGIN}; nothing while neither foot bears. "
+    "Half of the reward is for the load alone. The other half is multiplied by a factor that is 1 while the left "
+    f"ankle's lead on the right one is within {_LEAD_BOUND} of a step's length, `target_speed * gait.stride_seconds / "
+    "2`, of that length times the cosine of the clock's phase; beyond it a Gaussian that has fallen to a tenth after "
+    f"another {_LEAD_MARGIN}. All times `height` / 0.1, and less where the pelvis tilts, as `upright` is where the "
+    "chest does",
 )
 
 _TRUNK: Bounds = ((-5.0, 5.0), (-5.0, 5.0), (-5.0, 5.0))
@@ -97,7 +98,7 @@ _CLEAR = wp.constant(0.03)
 #: Particles of a foot within this height above its lowest are its sole [m].
 _SOLE = 0.03
 #: Stands for the left foot's share where nothing bears.
-NOTHING = wp.constant(-1.0)
+NO_LOAD = wp.constant(-1.0)
 
 
 class GaitConfig(BaseModel):
@@ -105,7 +106,7 @@ class GaitConfig(BaseModel):
 
     model_config = FROZEN
 
-    worth: float = Field(
+    weight: float = Field(
         0.35, ge=0.0, le=0.7, description="reward for feet in turn, taken from that of speed; 0: no clock [-]"
     )
     stride_seconds: float = Field(1.0, ge=0.2, le=5.0, description="time of two steps, one of each foot [s]")
@@ -118,7 +119,7 @@ class GaitConfig(BaseModel):
 class Gait:
     """Constants of a gait."""
 
-    worth: float  # reward
+    weight: float  # reward
     stride: float  # [control steps]
     step_length: float  # [m]
     arm_swing: float  # [rad]
@@ -129,7 +130,7 @@ class Gait:
     upper: wp.array(dtype=wp.vec3)  # [rad]
 
 
-def gait_rule(
+def make_gait(
     config: GaitConfig, speed: float, posture_cost: float, control_dt: float, points: BodyPoints, device: str
 ) -> Gait:
     """Return the constants of a gait at a ``speed`` [m/s], for a body whose particles are ``points``."""
@@ -160,19 +161,19 @@ def check_gait(config: GaitConfig, speed: float, control_dt: float) -> None:
     Raises:
         ConfigError: a stride has too few control steps, or steps would be longer than legs.
     """
-    if config.worth == 0.0:
+    if config.weight == 0.0:
         return
     if _step_length(config, speed) > _REACH:
         raise ConfigError(
             f"target_speed={speed} and gait.stride_seconds={config.stride_seconds} make steps of "
             f"{_step_length(config, speed):.3g} m, and legs reach {_REACH} m; use a stride of at most "
-            f"{2.0 * _REACH / speed:.3g} s, a lower speed, or gait.worth=0 for no gait"
+            f"{2.0 * _REACH / speed:.3g} s, a lower speed, or gait.weight=0 for no gait"
         )
     if config.stride_seconds < (_LEAST_STEPS - 0.01) * control_dt:
         raise ConfigError(
             f"gait.stride_seconds={config.stride_seconds} is less than {_LEAST_STEPS:.0f} control steps of "
             f"{control_dt:.3g} s; use at least {_LEAST_STEPS * control_dt:.3g}, a shorter physics.control_dt, or "
-            "gait.worth=0 for no gait"
+            "gait.weight=0 for no gait"
         )
 
 
@@ -192,27 +193,27 @@ def phase_of(gait: Gait, steps: float):
 
 
 @wp.func
-def load_in_turn(gait: Gait, step: int, left: float):
-    """Return the reward, from 0 to 1, of the left foot's share of the load, or 0 for :data:`NOTHING`.
+def load_reward(gait: Gait, step: int, left: float):
+    """Return the reward, from 0 to 1, of the left foot's share of the load, or 0 for :data:`NO_LOAD`.
 
-    By the clock in the middle of the step that the counter counts next.
+    By the clock in the middle of the control step in progress (`step_count` is incremented after the outcome).
     """
-    if left == NOTHING:
+    if left == NO_LOAD:
         return 0.0
     due = wp.clamp(0.5 + _STEEPNESS * wp.sin(phase_of(gait, float(step) + 0.5)), 0.0, 1.0)
-    return tolerance(wp.abs(left - due), _BOUND, _MARGIN)
+    return tolerance(wp.abs(left - due), _LOAD_BOUND, _LOAD_MARGIN)
 
 
 @wp.func
-def step_in_turn(gait: Gait, step: int, bones: Bones, e: int, ahead: wp.vec3):
+def step_reward(gait: Gait, step: int, bones: Bones, e: int, ahead: wp.vec3):
     """Return the reward, from 0 to 1, of the left ankle's lead on the right one along the unit vector ``ahead``.
 
-    By the clock at the end of the step that the counter counts next. At phase 0 the left foot is down in front by the
-    length of a step, half a stride later the right one.
+    By the clock at the end of the control step in progress (`step_count` is incremented after the outcome). At phase 0
+    the left foot is down in front by the length of a step, half a stride later the right one.
     """
     lead = wp.dot(bones.position[e, _LEFT_ANKLE] - bones.position[e, _RIGHT_ANKLE], ahead)
     due = gait.step_length * wp.cos(phase_of(gait, float(step) + 1.0))
-    return tolerance(wp.abs(lead - due), _SHORT * gait.step_length, _SHORT_MARGIN * gait.step_length)
+    return tolerance(wp.abs(lead - due), _LEAD_BOUND * gait.step_length, _LEAD_MARGIN * gait.step_length)
 
 
 @wp.func
@@ -227,14 +228,14 @@ def lift_of(gait: Gait, body: Body, x: wp.array2d(dtype=wp.vec3), e: int, foot: 
 
 
 @wp.func
-def left_load(gait: Gait, bones: Bones, sensors: Sensors, x: wp.array2d(dtype=wp.vec3), e: int):
-    """Return the left foot's share of the ground's load, or :data:`NOTHING`.
+def left_load_share(gait: Gait, bones: Bones, sensors: Sensors, x: wp.array2d(dtype=wp.vec3), e: int):
+    """Return the left foot's share of the ground's load, or :data:`NO_LOAD`.
 
     The levers between the ankles ignore the length of the soles: on the toes of the rear foot, they give some of its
     load to the foot in front. A foot in the air has none.
     """
     if sensors.boundary_impulse[e, 0][2] <= 0.0:
-        return NOTHING
+        return NO_LOAD
     left_off = lift_of(gait, bones.body, x, e, 0) > _CLEAR
     right_off = lift_of(gait, bones.body, x, e, 1) > _CLEAR
     if left_off == right_off:
@@ -273,8 +274,8 @@ def arm_pose(gait: Gait, phase: float, b: int):
 
 @wp.kernel
 def hang_arms(
-    episodes: Episodes,
     gait: Gait,
+    episodes: Episodes,
     # in and out
     command_rotation: wp.array2d(dtype=wp.quat),
 ):
@@ -292,7 +293,10 @@ def swing_arms(
     # out
     reference_rotation: wp.array2d(dtype=wp.quat),
 ):
-    """Write the pose at the end of the step that the counter counts next; the pelvis' is the commanded one."""
+    """Write the pose at the end of the control step in progress (`step_count` is incremented after the outcome).
+
+    The pelvis' rotation is the commanded one.
+    """
     e, b = wp.tid()
     q = command_rotation[e, b]
     if b > 0:
