@@ -111,11 +111,11 @@ def find_head(
 
 @wp.kernel
 def observe_head(
-    agent: int,
-    start: int,
     bones: Bones,
     head: wp.array(dtype=wp.vec3),
     ball: wp.array(dtype=wp.vec3),
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -183,7 +183,7 @@ at most 1, half of it for the goal."""
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         start = self.record_gate_terms(env, graph, agent, start)
         self.record_gap(env, graph)
-        inputs = [agent, start, env.bones[agent], self.head, self.ball_column(env, "position")]
+        inputs = [env.bones[agent], self.head, self.ball_column(env, "position"), agent, start]
         graph.launch(observe_head, env.num_envs, inputs, [env.observation])
 
 

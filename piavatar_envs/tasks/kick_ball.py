@@ -119,7 +119,7 @@ at most 1, half of it for the goal."""
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         start = self.record_gate_terms(env, graph, agent, start)
-        inputs = [agent, start, env.bones[agent], self.ball_column(env, "position")]
+        inputs = [env.bones[agent], self.ball_column(env, "position"), agent, start]
         graph.launch(observe_feet, env.num_envs, inputs, [env.observation])
 
 

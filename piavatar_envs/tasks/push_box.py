@@ -170,12 +170,12 @@ def judge(
 @wp.kernel
 def observe(
     push: Push,
-    agent: int,
-    start: int,
     bones: Bones,
     props: Props,
     hands: wp.array2d(dtype=wp.vec3),
     target: wp.array(dtype=wp.vec3),
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -191,11 +191,11 @@ def observe(
 
 @wp.kernel
 def observe_lead(
-    agent: int,
-    start: int,
     bones: Bones,
     command_rotation: wp.array2d(dtype=wp.quat),
     command_root: wp.array(dtype=wp.vec3),
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -343,10 +343,10 @@ each action the command is clamped to within 0.1 m and 0.3 rad of the body."""
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_hands(env, graph)
         state, bones = env.simulation.avatar.state, env.bones[agent]
-        inputs = [self.push, agent, start, bones, env.props, self.hands, self.target]
+        inputs = [self.push, bones, env.props, self.hands, self.target, agent, start]
         graph.launch(observe, env.num_envs, inputs, [env.observation])
         last = start + sum(term.size for term in self.observation_terms[:-1])
-        inputs = [agent, last, bones, state.command_rotation, state.command_root]
+        inputs = [bones, state.command_rotation, state.command_root, agent, last]
         graph.launch(observe_lead, env.num_envs, inputs, [env.observation])
 
     def markers(self, env, index: int) -> list[Marker]:

@@ -143,11 +143,11 @@ def judge_push(
 
 @wp.kernel
 def observe_push(
-    agent: int,
-    start: int,
     bones: Bones,
     flying: wp.array(dtype=int),
     props: Props,
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -247,7 +247,7 @@ greatest impulse of the episode so far: sorted by it, episodes show which pushes
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         start = record_observe_upright(env, graph, agent, start)
-        inputs = [agent, start, env.bones[agent], self.flying, env.props]
+        inputs = [env.bones[agent], self.flying, env.props, agent, start]
         graph.launch(observe_push, env.num_envs, inputs, [env.observation])
 
 

@@ -255,12 +255,12 @@ def judge(
 
 @wp.kernel
 def observe(
-    agent: int,
-    start: int,
     bones: Bones,
     clip_rotation: wp.array2d(dtype=wp.quat),
     clip_world: wp.array2d(dtype=wp.quat),
     clip_position: wp.array2d(dtype=wp.vec3),
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -461,7 +461,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_clip(env, graph)
-        inputs = [agent, start, env.bones[agent], self.clip_rotation, self.clip_world, self.clip_position]
+        inputs = [env.bones[agent], self.clip_rotation, self.clip_world, self.clip_position, agent, start]
         graph.launch(observe, (env.num_envs, NUM_JOINTS), inputs, [env.observation])
 
 

@@ -116,8 +116,8 @@ def turn_and_weigh(random: wp.uint32, e: int, ball: Ball, first: Props):
 
 @wp.kernel
 def draw_gate(
-    episodes: Episodes,
     gate: Gate,
+    episodes: Episodes,
     start: wp.array(dtype=wp.vec3),
     # out
     course: Course,
@@ -230,11 +230,11 @@ def measure_ball(
 def observe_gate(
     gate: Gate,
     course: Course,
-    agent: int,
-    start: int,
     bones: Bones,
     ball: wp.array(dtype=wp.vec3),
     density: wp.array(dtype=float),
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -250,10 +250,10 @@ def observe_gate(
 
 @wp.kernel
 def observe_feet(
-    agent: int,
-    start: int,
     bones: Bones,
     ball: wp.array(dtype=wp.vec3),
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -413,7 +413,7 @@ class GateTask(Task):
         record_standing(env, graph, self.config.pose_noise)
         self.record_ball(env, graph)
         start = env.first_props.position[:, self.index]
-        graph.launch(draw_gate, env.num_envs, [env.episodes, self.gate, start], [self.course])
+        graph.launch(draw_gate, env.num_envs, [self.gate, env.episodes, start], [self.course])
 
     def record_outcome(self, env, graph) -> None:
         self.record_gap(env, graph)
@@ -427,7 +427,7 @@ class GateTask(Task):
     def record_gate_terms(self, env, graph, agent: int, start: int) -> int:
         """Append: write :data:`GATE_TERMS` from component ``start``; return the component after them."""
         ball = [self.ball_column(env, "position"), self.ball_column(env, "density")]
-        inputs = [self.gate, self.course, agent, start, env.bones[agent], *ball]
+        inputs = [self.gate, self.course, env.bones[agent], *ball, agent, start]
         graph.launch(observe_gate, env.num_envs, inputs, [env.observation])
         return start + _OWN_TERMS
 

@@ -293,10 +293,10 @@ class RingTask(Task):
         return record_root_clamp(env, graph, self.config.root_lead_limit, self.config.root_turn_lead_limit)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        inputs = [agent, env.layout[RING_CENTRE.name].slice.start, env.bones[agent]]
+        inputs = [env.bones[agent], agent, env.layout[RING_CENTRE.name].slice.start]
         graph.launch(observe_centre, env.num_envs, inputs, [env.observation])
         if OTHERS_IN in env.layout:
-            inputs = [agent, env.layout[OTHERS_IN].slice.start, env.episodes]
+            inputs = [env.episodes, agent, env.layout[OTHERS_IN].slice.start]
             graph.launch(observe_others_in, (env.num_envs, env.num_agents - 1), inputs, [env.observation])
 
 
@@ -321,9 +321,9 @@ def has_won(episodes: Episodes, out: wp.array2d(dtype=wp.bool), e: int, agent: i
 
 @wp.kernel
 def observe_centre(
+    bones: Bones,
     agent: int,
     start: int,
-    bones: Bones,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -336,9 +336,9 @@ def observe_centre(
 
 @wp.kernel
 def observe_others_in(
+    episodes: Episodes,
     agent: int,
     start: int,
-    episodes: Episodes,
     # out
     observation: wp.array3d(dtype=float),
 ):

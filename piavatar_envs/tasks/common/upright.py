@@ -219,10 +219,10 @@ def left_foot_share(bones: Bones, sensors: Sensors, e: int, agent: int):
 
 @wp.kernel
 def observe_upright(
-    agent: int,
-    start: int,
     bones: Bones,
     sensors: Sensors,
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -237,7 +237,7 @@ def observe_upright(
 
 def record_observe_upright(env: EpisodeArrays, graph: LaunchGraph, agent: int, start: int) -> int:
     """Append: write :data:`UPRIGHT_TERMS` from component ``start``; return the component after them."""
-    inputs = [agent, start, env.bones[agent], env.simulation.sensors]
+    inputs = [env.bones[agent], env.simulation.sensors, agent, start]
     graph.launch(observe_upright, env.num_envs, inputs, [env.observation])
     return start + sum(term.size for term in UPRIGHT_TERMS)
 

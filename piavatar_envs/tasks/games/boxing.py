@@ -186,7 +186,7 @@ def judge(
     outcome.metrics[e, agent, 0] = score[e, agent]
     outcome.metrics[e, agent, 1] = given_impulse
     outcome.metrics[e, agent, 2] = taken_impulse
-    # the step counter has not moved yet
+    # `step_count` is incremented after the outcome
     gong = episodes.step_count[e] + 1 >= rules.max_steps and episodes.failure[e] == 0 and not out[e, agent]
     outcome.success[e, agent] = won or (gong and leads(episodes, score, e, agent))
     outcome.terminated[e, agent] = won or out[e, agent]

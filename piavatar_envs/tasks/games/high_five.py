@@ -135,10 +135,10 @@ def judge(
 
 @wp.kernel
 def observe_hands(
-    agent: int,
-    start: int,
     bones: Bones,
     hands: Hands,
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -314,7 +314,7 @@ the hands together is not enough: they must swing, at the same moment."""
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_hands(env, graph)
-        graph.launch(observe_hands, env.num_envs, [agent, start, env.bones[agent], self.hands], [env.observation])
+        graph.launch(observe_hands, env.num_envs, [env.bones[agent], self.hands, agent, start], [env.observation])
         at = [env.layout[name].slice.start if name in env.layout else -1 for name in ("hand_side", "least_impulse")]
         graph.launch(observe_draws, env.num_envs, [agent, *at, self.side, self.least], [env.observation])
 

@@ -202,14 +202,14 @@ def judge(
 @wp.kernel
 def observe_game(
     rule: PassRule,
-    agent: int,
-    start: int,
     bones: Bones,
     pelvis: wp.array2d(dtype=wp.vec3),
     ball: wp.array(dtype=wp.vec3),
     density: wp.array(dtype=float),
     place: wp.vec3,
     play: Play,
+    agent: int,
+    start: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -412,9 +412,9 @@ actions."""
         self.referee.record(env, graph)
         bones, ball, density = env.bones[agent], self._ball(env, "position"), self._ball(env, "density")
         place = wp.vec3(*self.scene.avatars[agent].position, 0.0)
-        inputs = [agent, start, bones, self.referee.pelvis, ball, density, place, self.play]
+        inputs = [bones, self.referee.pelvis, ball, density, place, self.play, agent, start]
         graph.launch(observe_game, env.num_envs, [self.rule, *inputs], [env.observation])
-        inputs = [agent, env.layout[FEET_TERMS[0].name].slice.start, bones, ball]
+        inputs = [bones, ball, agent, env.layout[FEET_TERMS[0].name].slice.start]
         graph.launch(observe_feet, env.num_envs, inputs, [env.observation])
 
 

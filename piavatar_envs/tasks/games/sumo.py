@@ -114,10 +114,10 @@ def judge(
 
 @wp.kernel
 def observe_rim(
-    agent: int,
-    place: int,
     radius: float,
     bones: Bones,
+    agent: int,
+    place: int,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -195,7 +195,7 @@ does not lose its balance."""
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         super().record_observe(env, graph, agent, start)
-        inputs = [agent, start + RING_CENTRE.size, self.config.ring_radius, env.bones[agent]]
+        inputs = [self.config.ring_radius, env.bones[agent], agent, start + RING_CENTRE.size]
         graph.launch(observe_rim, env.num_envs, inputs, [env.observation])
 
     def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
