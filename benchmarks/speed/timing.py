@@ -88,6 +88,7 @@ def _launch_times(graph: LaunchGraph) -> dict[str, list[float]]:
 def array_bytes(device: str) -> int:
     """Return bytes in use: on a GPU those of Warp's memory pool, on a CPU those of the Warp arrays that are alive."""
     target = wp.get_device(device)
+    gc.collect()  # else what is garbage now and gone later would count against what is measured in between
     if not target.is_cuda:
         own = (item for item in gc.get_objects() if type(item) is wp.array)  # not fixed arrays in kernels
         return sum(array.capacity for array in own if array.device == target and array.deleter is not None)
