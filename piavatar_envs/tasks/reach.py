@@ -23,18 +23,11 @@ from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
-#: Greatest azimuth of the swing's middle to either side [rad].
-SIDE = wp.constant(1.6)
-#: Least elevation of the swing's middle [rad].
-BELOW = wp.constant(-0.7)
-#: Greatest elevation of the swing's middle [rad].
-ABOVE = wp.constant(0.9)
-#: Least bound of the target's speed over `target_speed` [-].
-SLOWEST = wp.constant(0.3)
-#: A whole turn [rad].
-TURN = wp.constant(6.2831853)
-#: Joint at the centre of the target's sphere.
-CHEST = wp.constant(joint_index("spine3"))
+SIDE = wp.constant(1.6)  # greatest azimuth of the swing's middle [rad]
+BELOW, ABOVE = wp.constant(-0.7), wp.constant(0.9)  # its least and greatest elevation [rad]
+SLOWEST = wp.constant(0.3)  # least bound of the target's speed over `target_speed` [-]
+TURN = wp.constant(6.2831853)  # a whole turn [rad]
+CHEST = wp.constant(joint_index("spine3"))  # at the centre of the target's sphere
 #: Columns of ``outcome.terms``, in the order of ``ReachTask.rewards``.
 TERM_REACH, TERM_CONTROL = map(wp.constant, range(2))
 COURSE = (
