@@ -132,7 +132,7 @@ def test_gates_are_drawn_before_the_ball_and_spread(device):
     episodes.mask = wp.array(mask, dtype=wp.bool, device=device)
     episodes.seed = wp.array(np.arange(n, dtype=np.int32), dtype=int, device=device)
     episodes.episode = wp.array(np.arange(n, dtype=np.int32) // 7, dtype=int, device=device)
-    wp.launch(draw_gate, n, [episodes, gate, vectors(start, device), course], device=device)
+    wp.launch(draw_gate, n, [gate, episodes, vectors(start, device), course], device=device)
     center, forward = course.center.numpy(), course.forward.numpy()
     assert not center[~mask].any() and not course.best.numpy()[~mask].any(), "those not reset keep theirs"
     way = (center - start)[mask]
