@@ -47,7 +47,9 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
 6. *Fit*, after a new mass matrix: the pose is moved by a share of ``M^-1 J^T m (x - LBS)``, with the particles'
    displacements from their skinned places ``LBS`` at the beginning of the substep.
 
-After a control step, :func:`~piavatar_envs.avatar.torque_control.flesh_coupling.put_in_place` moves firm particles,
+After a control step, ``F`` approaches the strain measured against the skinned places
+(:mod:`~piavatar_envs.avatar.torque_control.flesh_strain`). Then
+:func:`~piavatar_envs.avatar.torque_control.flesh_coupling.put_in_place` moves firm particles,
 those of bones, to their skinned places, but not beyond boundaries. It changes no velocity; the angular
 momentum ``m s x v`` of displacement ``s`` is compensated in the affine velocity ``C``. ``slip`` stores the
 displacement, so that the pull stays the same and feet come to rest.

@@ -1,4 +1,4 @@
-"""Coupling of flesh and bones under torques: implicit pulls, and placement of firm particles."""
+"""Coupling of flesh and bones under torques: implicit pulls, the split of the velocity, placement of firm particles."""
 
 from __future__ import annotations
 
@@ -89,10 +89,10 @@ def attach_flesh(
     """Update ``u`` to the new ``J``, pull every particle to its skinned place, and sum moments of the bones.
 
     The change of ``J qdot`` with the pose is added to ``u``. ``vk`` keeps
-    :func:`~piavatar_envs.avatar.torque_control.joint_motion.motion_apart` of particles that several bones move. The
-    pull is implicit in time and critically damped, with ``rate`` [1/s]; a rate of 0 leaves a velocity exactly as it is.
-    The moments are those of the velocity that the pull removes, of the remaining velocity, and of the displacements to
-    the skinned places.
+    :func:`~piavatar_envs.avatar.torque_control.joint_motion.motion_apart` of particles that several bones move, and
+    ``spin`` the displacements to the skinned places, both for :func:`split_velocity`. The pull is implicit in time and
+    critically damped, with ``rate`` [1/s]; a rate of 0 leaves a velocity exactly as it is. The moments are those of
+    the velocity that the pull removes, of the remaining velocity, and of the displacements to the skinned places.
 
     Over ``(num_envs, partitions, PARTITION_THREADS)``, a CUDA block a partition; on a CPU one thread has the only one.
     """

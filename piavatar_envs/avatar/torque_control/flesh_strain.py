@@ -22,6 +22,7 @@ from piavatar_envs.avatar.skinning import skinned_place
 from piavatar_envs.avatar.torque_control.mass_matrix import I3
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import matrix_at, set_vector, store_matrix, vector_at
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -48,11 +49,9 @@ def make_neighbours(links: np.ndarray, count: int, device: str) -> Neighbours:
     """Upload the neighbours of ``count`` particles, from pairs of them, shape ``(L, 2)``."""
     pairs = np.concatenate([links, links[:, ::-1]])
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-    made = Neighbours()
-    made.particle = wp.array(pairs[:, 1].astype(np.int32), dtype=int, device=device)
-    starts = np.searchsorted(pairs[:, 0], np.arange(count + 1)).astype(np.int32)
-    made.start = wp.array(starts, dtype=int, device=device)
-    return made
+    arrays = {"particle": pairs[:, 1], "start": np.searchsorted(pairs[:, 0], np.arange(count + 1))}
+    uploaded = {name: wp.array(v.astype(np.int32), dtype=int, device=device) for name, v in arrays.items()}
+    return make_struct(Neighbours, **uploaded)
 
 
 @wp.kernel
