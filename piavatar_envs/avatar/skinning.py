@@ -197,9 +197,9 @@ def blend_changes(record: wp.array2d(dtype=vec8), e: int, skin: wp.array(dtype=w
     ...
 
 
-@wp.func_native(_blend(12, 12))
+@wp.func_native(_blend(12, 9))
 def blend_steps(record: wp.array2d(dtype=vec12), e: int, skin: wp.array(dtype=wp.vec4), p: int) -> vec12:
-    """Run :func:`blend_changes` for twelve numbers: two rigid motions of each bone."""
+    """Run :func:`blend_changes` for nine numbers: a rigid motion of each bone, and a spin."""
     ...
 
 

@@ -48,6 +48,12 @@ def symmetric(diag: wp.vec3, off: wp.vec3):
 
 
 @wp.func
+def summed_second_moment(s: vec16):
+    """Return the second moment [kg m^2] of a bone's sums, which have it from component 7 on."""
+    return symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
+
+
+@wp.func
 def point_inertia(mass: float, d: wp.vec3):
     """Return the inertia of a point mass at ``d``."""
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
@@ -75,7 +81,7 @@ def fit_bone(
     m = wp.max(s[0], 1.0e-12)
     d = wp.vec3(s[1], s[2], s[3]) / m
     V = wp.vec3(s[4], s[5], s[6]) / m
-    second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12])) - m * wp.outer(d, d)
+    second = summed_second_moment(s) - m * wp.outer(d, d)
     I = wp.diag(wp.vec3(wp.trace(second))) - second
     L = wp.vec3(s[13], s[14], s[15]) - m * wp.cross(d, V)
     bones.center[e, b] = reference[e, b] + d

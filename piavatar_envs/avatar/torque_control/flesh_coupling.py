@@ -152,9 +152,9 @@ def split_velocity(
     turns by ``theta`` would end ``1 + theta^2 / 2`` times as far from its axis; ``u`` would have to lead it back, and
     its gradient would strain the flesh, always in the same sense.
 
-    The total velocity is ``u`` plus the first of the bones' motions in ``steps``, about the pelvis joint at the
-    beginning, plus the motion apart that :func:`attach_flesh` leaves in ``vk``. The second motion in ``steps``, that of
-    the midpoint, gives the spin. :func:`attach_flesh` leaves the displacements to the skinned places in ``spin``.
+    The total velocity is ``u`` plus the bones' motion in ``steps``, about the pelvis joint at the
+    beginning, plus the motion apart that :func:`attach_flesh` leaves in ``vk``. ``steps`` has the spin at the midpoint,
+    too. :func:`attach_flesh` leaves the displacements to the skinned places in ``spin``.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -172,7 +172,7 @@ def split_velocity(
         apart = vector_from(driven.vk, body.first + body.alone, e, n)
         steps = blend_steps(w.steps, e, body.skin, p)
         end = blend_places(w.end, e, body.skin, p, pulled_rest(body, e, p, w))
-        spin = wp.vec3(steps[9], steps[10], steps[11])
+        spin = wp.vec3(steps[6], steps[7], steps[8])
         turn = wp.cross(spin, way)
         vk = (end - way - arm) / dt - turn - 0.5 * dt * wp.cross(spin, turn)
         total += blended_motion(steps, arm) + apart

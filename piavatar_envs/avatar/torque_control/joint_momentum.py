@@ -11,7 +11,7 @@ import warp as wp
 from piavatar_envs.avatar.skinning import motion_at
 from piavatar_envs.avatar.torque_control.joint_motion import add_ancestors3, set_triple
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, I3, NUM_DOF
-from piavatar_envs.avatar.tracking import point_inertia, spin_of, symmetric
+from piavatar_envs.avatar.tracking import point_inertia, spin_of, summed_second_moment, symmetric
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import vec8, vec12, vec16
 from piavatar_envs.core.cuda_intrinsics import (
@@ -133,10 +133,9 @@ def bias_forces(
         s = bones[e, b]
         spin = wp.vec3(moving[e, b][3], moving[e, b][4], moving[e, b][5])
         first = wp.vec3(s[1], s[2], s[3])
-        second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
         pull = angular[row, b]
         linear[row, b] = s[0] * pull + wp.cross(spin, wp.cross(spin, first))
-        angular[row, b] = wp.cross(first, pull) - wp.cross(spin, second * spin)
+        angular[row, b] = wp.cross(first, pull) - wp.cross(spin, summed_second_moment(s) * spin)
 
 
 # A lane of a warp sums one of the 28 numbers, so that those of a chunk are loaded at once, several chunks ahead.
@@ -359,7 +358,7 @@ def balance(
         d = wp.vec3(s[1], s[2], s[3])  # first moment about the joint, as are the others
         w = wp.vec3(field[e, b][3], field[e, b][4], field[e, b][5])
         v = motion_at(field[e, b], arm)  # at the joint
-        second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
+        second = summed_second_moment(s)
         inertia = wp.diag(wp.vec3(wp.trace(second))) - second
         p = s[0] * v + wp.cross(w, d) - reaction * wp.vec3(s[4], s[5], s[6])
         P += p

@@ -109,7 +109,7 @@ def motion_apart(b: vec12):
 
 @wp.func
 def blended_motion(b: vec12, arm: wp.vec3):
-    """Return the velocity of the bones' blended first motions at ``arm`` from their reference point [m/s].
+    """Return the velocity of the bones' blended motion at ``arm`` from their reference point [m/s].
 
     ``b`` is a record of :func:`piavatar_envs.avatar.skinning.blend_images` or
     :func:`piavatar_envs.avatar.skinning.blend_steps`.

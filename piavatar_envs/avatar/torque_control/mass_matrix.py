@@ -35,7 +35,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
     lower_entries,
     set_in_arenas,
 )
-from piavatar_envs.avatar.tracking import symmetric
+from piavatar_envs.avatar.tracking import summed_second_moment, symmetric
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import add_rows12, add_rows16, float_at, int_at, number_at, vec12, vec16, vector_at
 from piavatar_envs.core.cuda_intrinsics import BLOCK, highest_bit, sum_threads16, sync_block, warp_threads
@@ -304,8 +304,7 @@ def place_bone(
     s = vec16()
     for n in range(body.chunk_start[c] + thread, body.chunk_start[c + 1], threads):
         s += add_rows16(moments, e, n, n + 1)
-    second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
-    own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
+    own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), summed_second_moment(s))
     for n in range(pairs.neighbor_start[c] + thread, pairs.neighbor_start[c + 1], threads):
         d = pairs.neighbors[n]
         own -= moved(read_pair(records, c, d), wp.vec3(), position[e, d] - position[e, c])

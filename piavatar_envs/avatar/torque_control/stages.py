@@ -54,6 +54,7 @@ from piavatar_envs.avatar.torque_control.workspace import (
     load_workspace,
     row_in_arena,
     store_motion,
+    store_spin,
     store_workspace,
     view_vectors,
     warp_arena,
@@ -138,7 +139,7 @@ def advance_pose(body: Body, dt: float, move: int, off: int, e: int, thread: int
         time = -_FIT_SHARE
         spread_motion(body, w.pose.position, w.shares, off, e, thread, threads, w.moving)
     if move == 1:
-        store_motion(w.moving, e, 6, thread, threads, w.steps)
+        store_spin(w.moving, e, thread, threads, w.steps)
     move_joints(body, time, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
     if move == 1:
         place_bones(body, w.pose, w.pelvis[e], e, thread, threads, w.end)
@@ -343,7 +344,7 @@ def act(
     apply_torques(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, arena, near)
     predict_velocity(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
     spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.moving)
-    store_motion(near.moving, e, 0, thread, threads, w.steps)
+    store_motion(near.moving, e, thread, threads, w.steps)
     if thread == 0:
         w.pelvis[e] = near.pose.position[e, 0]
         support.force[e] = support.force[e] + per_time * triple_of(w.impulse, e, 0)

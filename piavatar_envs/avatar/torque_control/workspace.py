@@ -55,7 +55,7 @@ class TorqueWorkspace:
     # motion for the particles
     place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to current places, relative to the pelvis
     moving: wp.array2d(dtype=vec8)  # (num_envs, bones) rigid motions by the joints
-    # (num_envs, bones) rigid motions: total velocity less physical one, and J qdot at the midpoint
+    # (num_envs, bones) rigid motion by which the total velocity exceeds the physical one, and the spin at the midpoint
     steps: wp.array2d(dtype=vec12)
     # (num_envs, bones) from rest to the places at the end of a substep, relative to the pelvis at its beginning
     end: wp.array2d(dtype=wp.mat44)
@@ -199,15 +199,27 @@ def load_workspace(w: TorqueWorkspace, e: int):
     return w
 
 
-@wp.func_native(f"""
-const float* const from = reinterpret_cast<const float*>(&wp::index(motion, e, 0));
-float* const to = reinterpret_cast<float*>(&wp::index(steps, e, 0)) + first;
-for (int n = thread; n < {6 * NUM_JOINTS}; n += threads) to[12 * (n / 6) + n % 6] = from[8 * (n / 6) + n % 6];
-""")
-def store_motion(
-    motion: wp.array2d(dtype=vec8), e: int, first: int, thread: int, threads: int, steps: wp.array2d(dtype=vec12)
-):
-    """Copy the motion of all bones to their records in ``steps``, from component ``first`` on."""
+def _store(first: int, count: int, at: int) -> str:
+    """Return a snippet that copies ``count`` numbers of each bone from component ``first`` to component ``at``."""
+    return f"""
+const float* const from = reinterpret_cast<const float*>(&wp::index(motion, e, 0)) + {first};
+float* const to = reinterpret_cast<float*>(&wp::index(steps, e, 0)) + {at};
+for (int n = thread; n < {count * NUM_JOINTS}; n += threads) {{
+    const int b = n / {count}, c = n % {count};
+    to[12 * b + c] = from[8 * b + c];
+}}
+"""
+
+
+@wp.func_native(_store(first=0, count=6, at=0))
+def store_motion(motion: wp.array2d(dtype=vec8), e: int, thread: int, threads: int, steps: wp.array2d(dtype=vec12)):
+    """Copy the motion of all bones to their records in ``steps``."""
+    ...
+
+
+@wp.func_native(_store(first=3, count=3, at=6))
+def store_spin(motion: wp.array2d(dtype=vec8), e: int, thread: int, threads: int, steps: wp.array2d(dtype=vec12)):
+    """Copy the spin of all bones to their records in ``steps``, after the motion."""
     ...
 
 
