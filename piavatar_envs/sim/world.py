@@ -274,6 +274,7 @@ def record_control_step(
     if sensors_first:
         graph.parallel(*ends)
     if props:
+        props.record_strain(graph, state)
         props.record_tracking(graph, state)
 
 

@@ -48,7 +48,7 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
    displacements from their skinned places ``LBS`` at the beginning of the substep.
 
 After a control step, ``F`` approaches the strain measured against the skinned places
-(:mod:`~piavatar_envs.avatar.torque_control.flesh_strain`). Then
+(:mod:`~piavatar_envs.mpm.measured_strain`). Then
 :func:`~piavatar_envs.avatar.torque_control.flesh_coupling.put_in_place` moves firm particles,
 those of bones, to their skinned places, but not beyond boundaries. It changes no velocity; the angular
 momentum ``m s x v`` of displacement ``s`` is compensated in the affine velocity ``C``. ``slip`` stores the
@@ -80,7 +80,6 @@ Limits:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -91,8 +90,7 @@ from piavatar_envs.avatar.body.device import BodyPoints, partition_body
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.segment_sums import ALL_WORDS, PARTITION_THREADS, sum_moments, warps_of
 from piavatar_envs.avatar.torque_control.bone_contact import Ground
-from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, put_in_place, split_velocity
-from piavatar_envs.avatar.torque_control.flesh_strain import RATE, correct_strain, find_places, make_neighbours
+from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, find_places, put_in_place, split_velocity
 from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, MassMatrix, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
@@ -101,6 +99,7 @@ from piavatar_envs.avatar.types import Body, JointState, Pose, allocate
 from piavatar_envs.core.cuda_intrinsics import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import make_struct
+from piavatar_envs.mpm.measured_strain import make_neighbours, record_correction
 from piavatar_envs.mpm.types import Model, Scratch, State
 
 
@@ -321,8 +320,8 @@ class ArticulatedBody:
         if self._neighbours is not None:
             dim = (model.num_envs, self.body.count)
             graph.launch(find_places, dim, [self.body, w.place, state.failure], [self._places])
-            inputs = [self.body, -math.expm1(-RATE * model.control_dt), self._neighbours, state.x, self._places]
-            graph.launch(correct_strain, dim, [*inputs, state.failure], [state.F])
+            rest = self.body.rest, self._places
+            record_correction(graph, model, state, self._neighbours, self.body.first, *rest)
         if self.firm.size == 0:
             return
         inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, w.pose.position, state.u, state.vk]

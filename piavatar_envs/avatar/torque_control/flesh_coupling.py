@@ -190,6 +190,20 @@ def keep_outside(boundaries: Boundaries, e: int, x: wp.vec3):
 
 
 @wp.kernel
+def find_places(
+    body: Body,
+    place: wp.array2d(dtype=wp.mat44),
+    failure: wp.array(dtype=int),
+    # out
+    at: wp.array2d(dtype=wp.vec3),
+):
+    """Write the skinned places of all particles [m], relative to the pelvis joint; over ``(num_envs, particles)``."""
+    e, p = wp.tid()
+    if failure[e] == 0:
+        set_vector(at, e, p, skinned_place(body, place, e, p))
+
+
+@wp.kernel
 def put_in_place(
     body: Body,
     grid: Grid,
