@@ -55,6 +55,14 @@ def pack(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.column_stack([weights[:, 1:], bones.view(np.float32)])
 
 
+def unpack(skin: wp.array) -> tuple[np.ndarray, np.ndarray]:
+    """Return bones and weights, both ``(N, 4)``, as :func:`in_order` has them, from packed skinning on the device."""
+    packed = skin.numpy()
+    bones = np.ascontiguousarray(packed[:, 3]).view(np.uint32)[:, None] >> (8 * np.arange(4, dtype=np.uint32)) & 255
+    first = 1.0 - packed[:, 0] - packed[:, 1] - packed[:, 2]
+    return bones.astype(np.int32), np.column_stack([first, packed[:, :3]])
+
+
 @wp.func_native(READ + "return wp::vec_t<4, wp::int32>(joint(0), joint(1), joint(2), joint(3));")
 def bones_of(skin: wp.array(dtype=wp.vec4), p: int) -> wp.vec4i:
     """Return the bones that move particle ``p``."""

@@ -26,9 +26,17 @@ from piavatar_envs.envs.episodes import (
     seeds_as_int32,
 )
 from piavatar_envs.envs.observer import Observer
-from piavatar_envs.envs.state import SETTINGS, check_arrays, check_settings, settings_rows
+from piavatar_envs.envs.state import (
+    SETTINGS,
+    add_forces,
+    check_arrays,
+    check_settings,
+    has_forces,
+    settings_rows,
+)
 from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.checks import check_places
+from piavatar_envs.sim.forces import Target
 from piavatar_envs.sim.world import Simulation
 
 
@@ -100,6 +108,7 @@ class BatchEnv(EpisodeArrays):
         self.reset_graph = LaunchGraph(self.device, condition=self.begins)
         self.step_graph, self.observe_graph = LaunchGraph(self.device), LaunchGraph(self.device)
         self.count_graph, self.ended_graph = LaunchGraph(self.device), LaunchGraph(self.device)
+        self.end_forces_graph = LaunchGraph(self.device)
         self._record_reset()
         self._record_observation(self.observe_graph)
         self._record_step(self.step_graph)
@@ -172,6 +181,8 @@ class BatchEnv(EpisodeArrays):
         self.count_graph.run()
         self.simulation.shapes.draw(self.mask, self.seed, self.episode)
         self.reset_graph.run()
+        if self.simulation.forces:
+            self.end_forces_graph.run()
         self.simulation.shapes.mark_stale()
         return self.observation
 
@@ -246,6 +257,25 @@ class BatchEnv(EpisodeArrays):
         for controller in self.simulation.controllers:
             controller.assist.assign(shares)
 
+    def enable_forces(self) -> None:
+        """Record the step anew with external forces, unless it has them; takes the time of a recording, once.
+
+        Before, steps have no launches for forces, and states no arrays of them.
+        """
+        if self.simulation.forces:
+            return
+        self.simulation.enable_forces().record_reset(self.end_forces_graph, self.mask)
+        self.step_graph = LaunchGraph(self.device)
+        self._record_step(self.step_graph)
+        compile_graphs((self.step_graph, self.end_forces_graph))
+
+    def apply_force(self, target: Target, steps: int, at_point: bool) -> None:
+        """Let the force in ``simulation.forces.call`` act for ``steps`` control steps, once forces are enabled.
+
+        For the arguments see :meth:`piavatar_envs.sim.forces.Forces.add`. A reset ends it.
+        """
+        self.simulation.enable_forces().add(target, steps, at_point, self.failure)
+
     def arrays(self) -> dict[str, wp.array]:
         """Return every array of a checkpoint, by name."""
         clocks, flags = ("step_count", "head_start"), ("terminated", "truncated", "success", "alive")
@@ -272,7 +302,11 @@ class BatchEnv(EpisodeArrays):
                 type; nothing has changed then.
         """
         check_settings(state, self.config)
-        check_arrays(state, self.get_state())
+        if has_forces(state):
+            self.enable_forces()
+        present = self.get_state()
+        state = state if has_forces(state) else add_forces(state, present)
+        check_arrays(state, present)
         for name, array in self.arrays().items():
             array.assign(state[name])
         for avatar in self.simulation.shapes.of_host:

@@ -21,8 +21,22 @@ SETTINGS = "env.settings"
 _SHOWN, _BEGUN_WITH = ("render", "obs_mode"), "root_assist"
 #: Arrays that may hold numbers that are not finite: the next step finds them and ends the episode with a failure.
 _FOUND_BY_STEPS = ("particles.x", "particles.u", "particles.C", "particles.F")
+#: How the names of external forces begin; a state has them only after the first force.
+FORCES = "forces."
 #: How the names of shares of root assistance end.
 _ASSIST = ".assist"
+
+
+def has_forces(state: Mapping[str, Any]) -> bool:
+    """Return whether a state has arrays of external forces: it was saved after the first one."""
+    return any(name.startswith(FORCES) for name in state)
+
+
+def add_forces(state: Mapping[str, Any], present: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return a state with the arrays of external forces that ``present`` has, zeroed: no force acts."""
+    rows = len(next(iter(state.values()), ()))
+    missing = {name: np.zeros_like(value[:rows]) for name, value in present.items() if name.startswith(FORCES)}
+    return {**state, **missing}
 
 
 def check_state(state: Any, num_envs: int) -> None:

@@ -28,12 +28,14 @@ FAILURE_OUT_OF_GRID = 2
 FAILURE_CFL = 4  # too fast for the time step
 FAILURE_ACTION = 8
 FAILURE_BLOCKS = 16
+FAILURE_FORCE = 32  # an external force that is not finite, or one too many
 FAILURE_NAMES: dict[int, str] = {
     FAILURE_NONFINITE: "nonfinite",
     FAILURE_OUT_OF_GRID: "out_of_grid",
     FAILURE_CFL: "cfl",
     FAILURE_ACTION: "action",
     FAILURE_BLOCKS: "blocks",
+    FAILURE_FORCE: "force",
 }
 
 #: How prescribed motion is kept out of the deformation gradient (:mod:`piavatar_envs.mpm.g2p`).

@@ -27,6 +27,7 @@ from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
 from piavatar_envs.sim.bodies import Flesh, load_avatar, pose_control
 from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_places
+from piavatar_envs.sim.forces import Forces, Receivers
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
 from piavatar_envs.sim.randomize import Randomization, fastest_wave
 from piavatar_envs.sim.scene import Domain, assemble
@@ -58,6 +59,8 @@ class Simulation:
         props: the soft props.
         randomization: factors on mass, stiffness and friction, and the constants that they scale.
         shapes: bodies of random shape.
+        receivers: what external forces can act on.
+        forces: external forces; None before :meth:`enable_forces`.
         initial_colliders: poses and velocities of the colliders after a reset.
     """
 
@@ -102,6 +105,8 @@ class Simulation:
         self.randomization = Randomization(config.randomize, self.model, self.avatars)
         self.shapes = Shapes(self.flesh, self.avatars, self.model, self.randomization)
         self._build_props()
+        self.receivers = Receivers(self.avatars, self.controllers, self.props)
+        self.forces: Forces | None = None
 
     @property
     def avatar(self) -> Avatar:
@@ -222,9 +227,15 @@ class Simulation:
         graph.parallel_for_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
         self.props.record_tracking(graph, self.state)
 
+    def enable_forces(self) -> Forces:
+        """Return the external forces, which control steps that are recorded from now on apply."""
+        self.forces = self.forces or Forces(self.model, self.receivers)
+        return self.forces
+
     def record_step(self, graph: LaunchGraph) -> None:
         """Append a control step towards the avatars' goals; see :func:`record_control_step`."""
-        record_control_step(graph, self.avatars, self.controllers, self.model, self.state, self.scratch, self.props)
+        simulated = self.avatars, self.controllers, self.model, self.state, self.scratch
+        record_control_step(graph, *simulated, self.props, self.forces)
 
     def arrays(self) -> dict[str, wp.array]:
         """Return all arrays of a checkpoint by name."""
@@ -238,7 +249,7 @@ class Simulation:
         found |= self.shapes.arrays() | self.randomization.arrays()
         sensors = ("boundary_impulse", "boundary_moment", "pair_impulse", "part_impulse", "penetration")
         found |= {f"sensors.{name}": getattr(self.sensors, name) for name in sensors}
-        return found | self.props.arrays()
+        return found | self.props.arrays() | (self.forces.arrays() if self.forces else {})
 
 
 def record_control_step(
@@ -249,6 +260,7 @@ def record_control_step(
     state: State,
     scratch: Scratch,
     props: PropSet | None = None,
+    forces: Forces | None = None,
 ) -> None:
     """Append one control step, after which avatars and props are tracked.
 
@@ -257,10 +269,16 @@ def record_control_step(
     simulated = (model, state, scratch)
     begins = graph.branches(controllers, lambda controller, own: controller.record_begin(own))
     record_begin(graph, *simulated, branches=begins)  # activates blocks
+    if forces:
+        forces.record_begin(graph)
     for step in range(model.num_substeps):
+        if forces:
+            forces.record_before_controllers(graph, state)
         graph.parallel_for_each(
             controllers, lambda c, own, step=step: c.record_before_substep(own, state, scratch, step)
         )
+        if forces:
+            forces.record_before_substep(graph, state, step)
         record_substep(graph, *simulated, step)
 
     def end(index: int, own: LaunchGraph) -> None:
@@ -276,6 +294,8 @@ def record_control_step(
     if props:
         props.record_strain(graph, state)
         props.record_tracking(graph, state)
+    if forces:
+        forces.record_end(graph, state)
 
 
 def check_device(device: str) -> str:

@@ -30,7 +30,7 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
    (:mod:`~piavatar_envs.avatar.torque_control.joint_torques`,
    :mod:`~piavatar_envs.avatar.torque_control.bone_contact`)::
 
-       (M + A) d = dt (K e + tau) + J_b^T p - A (qdot + c),   A = dt D + dt^2 K
+       (M + A) d = dt (K e + tau) + J_b^T p + J_f^T F dt - A (qdot + c),   A = dt D + dt^2 K
 
    Torques between bones must change neither momentum nor angular momentum. Because ``M`` may be a few substeps old, the
    rigid motion that ``J d`` has in excess is subtracted, computed from the current moments of the bones.
@@ -64,6 +64,7 @@ Symbols:
 ``A``        implicit inertia of springs and dampers
 ``tau``      torques of the joints
 ``p, J_b``   impulses on points of bones that touch a boundary, and the Jacobian of these points
+``F, J_f``   external forces (:mod:`piavatar_envs.sim.forces`), and the Jacobian of the points where they act
 ``d``        velocity change by step 4
 ``h``        bias forces: centripetal and Coriolis forces of the bones at constant ``qdot``
 ``c``        velocity change from contact, gravity and flesh in the previous substep, the prediction for this one
@@ -221,6 +222,7 @@ class ArticulatedBody:
             whole=NUM_DOF,
             muscle=NUM_DOF,
             left=NUM_DOF,
+            push=rows(0, NUM_DOF),
         )
 
     def _upload(self, value: np.ndarray, dtype: type = float) -> wp.array:
@@ -238,6 +240,14 @@ class ArticulatedBody:
         besides = np.r_[np.zeros(3), np.repeat(self._inertia + self.tissue.lock.numpy(), 3)]
         own = self._workspace.diagonals[: self.model.num_envs]
         own.assign(np.broadcast_to(besides.astype(np.float32), own.shape))
+
+    def allocate_push(self) -> wp.array:
+        """Return an array of impulses of external forces, ``(num_envs, 69)``, for launches recorded from now on.
+
+        In every substep its generalised impulses join those that the joints solve for (step 4).
+        """
+        self._workspace.push = wp.zeros((self.model.num_envs, NUM_DOF), dtype=float, device=self.model.device)
+        return self._workspace.push
 
     def record_pose(self, graph: LaunchGraph, state: State) -> None:
         """Append the computation of the bones' places and motion, for joints that were not moved by a substep."""

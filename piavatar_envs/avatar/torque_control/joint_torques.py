@@ -270,6 +270,7 @@ def limit_torque(
 @wp.func
 def final_impulses(
     left: wp.array2d(dtype=float),
+    push: wp.array2d(dtype=float),
     change: wp.array2d(dtype=float),
     row_of_change: int,
     e: int,
@@ -278,6 +279,11 @@ def final_impulses(
     # in and out
     impulse: wp.array2d(dtype=float),
 ):
-    """Compute the impulses of joints and pelvis at the end of the substep: subtract ``left`` times the change."""
+    """Compute the impulses of joints and pelvis at the end of the substep: subtract ``left`` times the change.
+
+    Those of external forces, ``push``, which may have no rows, are subtracted too.
+    """
     for i in range(thread, NUM_DOF, threads):
         impulse[e, i] = impulse[e, i] - left[e, i] * change[row_of_change, i]
+        if push.shape[0] > 0:
+            impulse[e, i] = impulse[e, i] - push[e, i]

@@ -25,7 +25,7 @@ from piavatar_envs.avatar.torque_control.joint_momentum import (
     pass_down,
     predict_velocity,
 )
-from piavatar_envs.avatar.torque_control.joint_motion import move_joints, spread_motion, triple_of
+from piavatar_envs.avatar.torque_control.joint_motion import move_joints, set_triple, spread_motion, triple_of
 from piavatar_envs.avatar.torque_control.joint_torques import (
     Springs,
     Strength,
@@ -183,6 +183,15 @@ def limit_joints(
 
 
 @wp.func
+def push_of(w: TorqueWorkspace, e: int, k: int):
+    """Return triple ``k`` of the impulses by external forces; 0 is the pelvis' position."""
+    push = wp.vec3()
+    if w.push.shape[0] > 0:
+        push = triple_of(w.push, e, 3 * k)
+    return push
+
+
+@wp.func
 def apply_torques(
     body: Body,
     dt: float,
@@ -199,15 +208,16 @@ def apply_torques(
     arena: wp.uint64,
     w: TorqueWorkspace,
 ):
-    """Solve for the velocity change by springs, torques, tissue and bone contact, and write it to share ``own``.
+    """Solve for the velocity change by springs, torques, tissue, contact and external forces: share ``own``.
 
-    ``driven`` is the factor of the mass matrix with everything implicit.
+    ``driven`` is the factor of the mass matrix with everything implicit. ``impulse`` is left without external forces.
     """
     sync_threads(threads)
     for k in range(thread, TRIPLES, threads):
         joint_impulse(
             body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
         )
+        set_triple(w.impulse, e, 3 * k, triple_of(w.impulse, e, 3 * k) + push_of(w, e, k))
     load_factor(w.factors, driven, arena)
     factor = int(driven)
     contact = vec8()
@@ -222,10 +232,10 @@ def apply_torques(
         cuts += 1
         factor = w.factors.shape[0] - 1
         factorize(w.pattern, w.matrix, w.left, e, e, arena, factor, w.factors)
-    final_impulses(w.left, w.shares, own, e, thread, threads, w.impulse)
+    final_impulses(w.left, w.push, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
-    support = triple_of(w.impulse, e, 0) + wp.vec3(contact[0], contact[1], contact[2])
-    moment = triple_of(w.impulse, e, 3) + wp.vec3(contact[3], contact[4], contact[5])
+    support = triple_of(w.impulse, e, 0) + push_of(w, e, 0) + wp.vec3(contact[0], contact[1], contact[2])
+    moment = triple_of(w.impulse, e, 3) + push_of(w, e, 1) + wp.vec3(contact[3], contact[4], contact[5])
     if thread == 0:
         add_to_sensors(body, ground, contact, e, w.pose.position[e, 0])
     balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)

@@ -51,6 +51,7 @@ class TorqueWorkspace:
     # torques
     muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
     impulse: wp.array2d(dtype=float)
+    push: wp.array2d(dtype=float)  # (num_envs, 69) generalised impulses of external forces; no rows without any
     left: wp.array2d(dtype=float)  # (num_envs, 69) diagonal without muscles that have reached their limits
     # motion for the particles
     place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to current places, relative to the pelvis
