@@ -76,7 +76,7 @@ def watch_env(
     """
     try:
         inner = env.unwrapped
-        live = Live(inner.batch, inner.config.render.color, port)
+        live = Live(inner.batch, inner.apply_force, inner.config.render.color, port)
         try:
             show = Show(env, act, begin, live)
             show.begin(seed)
@@ -126,6 +126,7 @@ class Show:
         if self._over:
             self.begin()
         action = self._act(self._observation)
+        live.before_step()
         self._observation, reward, terminated, truncated, self._info = self._env.step(action)
         self._steps += 1
         self._return += float(reward)

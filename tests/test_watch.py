@@ -24,7 +24,7 @@ def open_show(device):
 
     def start(env_id: str, **settings):
         env, time = make(env_id, {"device": device, "fidelity": "tiny", **settings}), FakeTime()
-        live = Live(env.unwrapped.batch, port=8300, pace=Pace(time.clock, time.sleep))
+        live = Live(env.unwrapped.batch, env.unwrapped.apply_force, port=8300, pace=Pace(time.clock, time.sleep))
         begun = []
         still = np.zeros(env.action_space.shape, np.float32)
         show = watch.Show(env, lambda _observation: still, lambda: begun.append(1), live)

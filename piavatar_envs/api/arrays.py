@@ -33,6 +33,14 @@ class ArrayApi(Protocol):
         """Check a caller's actions and convert them; nothing has changed if they are refused."""
         ...
 
+    def vectors(self, name: str, values: Any, num_envs: int) -> Array:
+        """Check a caller's vectors, one for all environments or one each, and convert them: ``(num_envs, 3)``."""
+        ...
+
+    def mask(self, envs: Any, num_envs: int) -> Array:
+        """Check a caller's choice of environments, and convert it to a mask ``(num_envs,)`` bool."""
+        ...
+
     def write(self, values: Array, arrays: Sequence[wp.array]) -> None:
         """Write checked ``values`` into the arrays, row by row."""
         ...
@@ -74,6 +82,48 @@ class ArrayApi(Protocol):
         ...
 
 
+def check_vectors(name: str, values: Any, num_envs: int) -> np.ndarray:
+    """Return vectors as float32, ``(num_envs, 3)``, from one for all environments or one each.
+
+    Raises:
+        ValueError: no array of real numbers, a wrong shape, or a component that is not finite.
+    """
+    shapes = f"use shape (3,) or ({num_envs}, 3)"
+    try:
+        with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and is refused below
+            vectors = np.asarray(values, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} is a {type(values).__name__} ({error}); {shapes} of real numbers") from None
+    if vectors.shape not in ((3,), (num_envs, 3)):
+        raise ValueError(f"{name} has shape {vectors.shape}; {shapes}")
+    if not np.isfinite(vectors).all():
+        index = np.argwhere(~np.isfinite(vectors))[0].tolist()
+        raise ValueError(f"{name}{index} is {vectors[tuple(index)]}; it must be finite")
+    return np.broadcast_to(vectors, (num_envs, 3)).copy()
+
+
+def check_envs(envs: Any, num_envs: int) -> np.ndarray:
+    """Return the mask ``(num_envs,)`` bool of environments given as a mask, as indices, or as None for all.
+
+    Raises:
+        ValueError: a wrong shape or type, or there is no such environment.
+    """
+    if envs is None:
+        return np.ones(num_envs, bool)
+    given = np.atleast_1d(np.asarray(envs))
+    if given.dtype == bool and given.shape == (num_envs,):
+        return given
+    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+        what = f"has shape {given.shape} and type {given.dtype}"
+        raise ValueError(f"envs {what}; use a mask ({num_envs},) bool, or indices of environments")
+    unknown = given[(given < 0) | (given >= num_envs)]
+    if unknown.size:
+        raise ValueError(f"envs={unknown.tolist()}: there are num_envs={num_envs}; use 0 to {num_envs - 1}")
+    mask = np.zeros(num_envs, bool)
+    mask[given.astype(int)] = True
+    return mask
+
+
 class NumpyArrays:
     """Arrays on the host, whatever the device."""
 
@@ -90,6 +140,22 @@ class NumpyArrays:
             ValueError: a wrong shape, or a component that is not finite.
         """
         return check_actions(actions, shape, names)
+
+    def vectors(self, name: str, values: Any, num_envs: int) -> np.ndarray:
+        """Convert vectors to float32.
+
+        Raises:
+            ValueError: a wrong shape or type, or a component that is not finite.
+        """
+        return check_vectors(name, values, num_envs)
+
+    def mask(self, envs: Any, num_envs: int) -> np.ndarray:
+        """Convert a mask, indices or None (all environments) to a mask.
+
+        Raises:
+            ValueError: a wrong shape or type, or there is no such environment.
+        """
+        return check_envs(envs, num_envs)
 
     def write(self, values: np.ndarray, arrays: Sequence[wp.array]) -> None:
         """Write ``values`` into the arrays, row by row."""
@@ -201,6 +267,39 @@ class TorchArrays:
         if actions.device != self.device:
             raise ValueError(f"action is on {actions.device}, the environments are on {self.device}; use actions.to()")
         return actions.detach()
+
+    def vectors(self, name: str, values: Any, num_envs: int) -> Any:
+        """Convert vectors to a tensor on the device; the values of a tensor are not checked.
+
+        Raises:
+            ValueError: a wrong shape, type or device, or a component of a NumPy array that is not finite.
+        """
+        if not isinstance(values, self._torch.Tensor):
+            return self._torch.tensor(check_vectors(name, values, num_envs), device=self.device)
+        if tuple(values.shape) not in ((3,), (num_envs, 3)):
+            raise ValueError(f"{name} has shape {tuple(values.shape)}; use (3,) or ({num_envs}, 3)")
+        if values.dtype != self._torch.float32 or values.device != self.device:
+            raise ValueError(
+                f"{name} is of type {values.dtype} on {values.device}; use torch.float32 on {self.device}, or NumPy"
+            )
+        return values.detach().expand(num_envs, 3)
+
+    def mask(self, envs: Any, num_envs: int) -> Any:
+        """Convert a mask, indices or None (all environments) to a mask; the host waits for a tensor of indices.
+
+        Raises:
+            ValueError: a wrong shape, type or device, or there is no such environment.
+        """
+        torch = self._torch
+        if not isinstance(envs, torch.Tensor):
+            return self.from_host(check_envs(envs, num_envs))
+        if envs.dtype != torch.bool:
+            return self.from_host(check_envs(envs.cpu().numpy(), num_envs))
+        if tuple(envs.shape) != (num_envs,) or envs.device != self.device:
+            raise ValueError(
+                f"envs is a mask of shape {tuple(envs.shape)} on {envs.device}; use ({num_envs},) on {self.device}"
+            )
+        return envs
 
     def write(self, values: Any, arrays: Sequence[wp.array]) -> None:
         """Write ``values`` into the arrays, row by row."""

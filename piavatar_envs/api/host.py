@@ -21,7 +21,7 @@ from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.core.rng import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
 from piavatar_envs.envs.observations import ObservationLayout
-from piavatar_envs.envs.state import check_settings, check_state
+from piavatar_envs.envs.state import add_forces, check_settings, check_state, has_forces
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import failure_name
 from piavatar_envs.sim.world import check_device
@@ -95,7 +95,7 @@ class EpisodeHost:
         self.action_names: tuple[str, ...] = tuple(first.action_spec.names())
         self.ready, self.render_mode = False, render_mode
         self.pictures = Pictures(self.group_of, self.config.render)
-        self.live = Live(first, self.config.render.color) if render_mode == "human" else None
+        self.live = Live(first, self.apply_force, self.config.render.color) if render_mode == "human" else None
 
     @property
     def frame_rate(self) -> int:
@@ -197,6 +197,8 @@ class EpisodeHost:
 
     def advance(self, actions: Array) -> None:
         """Advance by one control step under actions that the caller has checked; at most in real time with a view."""
+        if self.live:
+            self.live.before_step()
         self.api.write(actions, [group.action for group in self.groups])
         self._run(BatchEnv.step)
         if self.live:
@@ -340,6 +342,7 @@ class EpisodeHost:
 
     def adopt(self, state: dict[str, np.ndarray], ready: bool) -> None:
         """Take over the state of another host and whether it is ready; a live view opens at the next reset."""
+        state = self.with_forces(state)
         parts = {name: np.split(np.asarray(value), self._splits) for name, value in state.items()}
         self.api.begin()
         for index, group in enumerate(self.groups):
@@ -356,6 +359,59 @@ class EpisodeHost:
         parts = np.split(checked_assist(share, self.num_envs), self._splits)
         for group, part in zip(self.groups, parts, strict=True):
             group.assist_root(part)
+
+    def apply_force(
+        self,
+        target: str,
+        force: Any,
+        point: Any = None,
+        steps: int = 1,
+        agent: str | None = None,
+        envs: Any = None,
+    ) -> None:
+        """Let a force act on a bone or a prop; for arguments and errors see :meth:`HostView.apply_force`."""
+        self.check_ready("apply_force")
+        check_count("steps", steps)
+        names = self.task.agent_names
+        if agent is not None and agent not in names:
+            raise ValueError(f"agent={agent!r} is not one of {', '.join(names)}")
+        index = None if agent is None else names.index(agent)
+        targets = [group.simulation.receivers.find(target, index) for group in self.groups]
+        mask, force = self.api.mask(envs, self.num_envs), self.api.vectors("force", force, self.num_envs)
+        at = force if point is None else self.api.vectors("point", point, self.num_envs)
+        if self.api.name == "numpy" and self.groups[0].simulation.forces:
+            taken = self.read(lambda group: group.simulation.forces.slots.remaining) > 0
+            full = np.flatnonzero(taken.all(1) & mask)
+            if full.size:
+                raise ValueError(
+                    f"environments {full.tolist()} have {taken.shape[1]} forces, the most that act at the same time; "
+                    "use fewer, or fewer steps"
+                )
+        self._enable_forces()
+        calls = [group.simulation.forces.call for group in self.groups]
+        for name, values in (("mask", mask), ("force", force), ("point", at)):
+            self.api.write(values, [getattr(call, name) for call in calls])
+        self.api.begin()
+        for group, own in zip(self.groups, targets, strict=True):
+            group.apply_force(own, steps, point is not None)
+        self.api.end()
+
+    def _enable_forces(self) -> None:
+        """Record the steps of all groups anew with external forces, unless they have them."""
+        if not self.groups[0].simulation.forces:
+            for group in self.groups:
+                group.enable_forces()
+            self._captured.discard(BatchEnv.step)
+
+    def with_forces(self, state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return ``state`` with arrays of external forces if the environments have some, and give them some if it has.
+
+        Where they were missing, no force acts.
+        """
+        if has_forces(state):
+            self._enable_forces()
+            return state
+        return add_forces(state, self.get_state()) if self.groups[0].simulation.forces else state
 
     def group_of(self, env: int) -> tuple[BatchEnv, int]:
         """Return the batch that holds environment ``env``, and its index there."""
@@ -477,6 +533,38 @@ class HostView:
             ValueError: it is out of range, of another shape, or the control is ``"pose"``.
         """
         self.host.assist_root(share)
+
+    def apply_force(
+        self,
+        target: str,
+        force: Any,
+        point: Any = None,
+        steps: int = 1,
+        agent: str | None = None,
+        envs: Any = None,
+    ) -> None:
+        """Let a constant force act on a bone or a prop, from the next step on; a reset ends it.
+
+        Forces add up, at most :data:`~piavatar_envs.sim.forces.SLOTS` in an environment. The first call takes the time
+        of a recording. See :mod:`piavatar_envs.sim.forces`.
+
+        Args:
+            target: a bone, by the name of its joint, or a prop.
+            force: in the world [N], shape ``(3,)``, or one for every environment, ``(num_envs, 3)``.
+            point: where it acts, in the world at the time of the call [m], shaped like ``force``; it moves with the
+                target from there. The target's centre of mass if not given, of a bone as in the rest pose.
+            steps: number of control steps.
+            agent: whose bone it is, by name, where there are several agents; not for a prop.
+            envs: environments in which it acts: a mask ``(num_envs,)`` bool, or indices; all if not given.
+
+        Raises:
+            ValueError: an unknown target, agent or environment, a wrong shape, type or device, less than one step, or
+                (NumPy) a component that is not finite, or an environment with too many forces; nothing has changed
+                then. The values of tensors are not checked on the host: such an environment ends with the failure
+                ``"force"``.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        self.host.apply_force(target, force, point, steps, agent, envs)
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return everything that the future depends on; ``set_state()`` restores it, bit for bit.

@@ -7,18 +7,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, body_part_of_joint
+from piavatar_envs.avatar.skinning import unpack
 from piavatar_envs.config import RenderConfig
 from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.sim.bodies import Flesh
+from piavatar_envs.sim.forces import Target
 
 if TYPE_CHECKING:
-    from piavatar_envs.render import Body, Marker, Scene, Skin
-    from piavatar_envs.render.live import LiveView
+    from scipy.spatial.transform import Rotation
+
+    from piavatar_envs.render import Arrow, Body, Marker, Scene, Skin
+    from piavatar_envs.render.live import Drag, LiveView
 
 #: Render modes of one environment, and of a batch: a live view shows one.
 RENDER_MODES = ("rgb_array", "human")
@@ -255,6 +261,114 @@ class Pace:
         self.begin()
 
 
+#: Rate of the spring between a dragged point and the mouse [1/s], and its greatest force over the dragged mass [m/s^2].
+DRAG_RATE, MOST_DRAG = 10.0, 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Grip:
+    """A bone or prop that a mouse has grabbed.
+
+    Attributes:
+        name, agent: of what is grabbed, as ``apply_force`` takes them.
+        target: the same on the device.
+        local: the grabbed point in the target's frame, shape ``(3,)`` [m].
+        mass: what moves with it: the prop, the limb or, with a bone of the trunk, the body [kg].
+        own_mass: the bone alone, or the prop [kg].
+    """
+
+    name: str
+    agent: str | None
+    target: Target
+    local: np.ndarray
+    mass: float
+    own_mass: float
+
+    def point(self, env: int) -> np.ndarray:
+        """Return where the grabbed point of environment ``env`` is [m]."""
+        at, turn = frame_of(self.target, env)
+        return at + turn.apply(self.local)
+
+
+def frame_of(target: Target, env: int) -> tuple[np.ndarray, Rotation]:
+    """Return position and rotation of a target's frame in environment ``env``."""
+    from scipy.spatial.transform import Rotation
+
+    frame = target.frame
+    position, rotation = (array.numpy()[env, target.column].astype(float) for array in (frame.position, frame.rotation))
+    return position, Rotation.from_quat(rotation)
+
+
+def grip_at(batch: BatchEnv, env: int, drag: Drag) -> Grip:
+    """Return the bone or prop at the point where a drag began."""
+    simulation = batch.simulation
+    avatars, props = simulation.avatars, simulation.props
+    mass = simulation.model.particles.mass.numpy()
+    mass = mass[min(env, len(mass) - 1)].astype(float)
+    if drag.body >= len(avatars):
+        name, agent = props.names[drag.body - len(avatars)], None
+        target, prop = simulation.receivers.find(name), props.props[drag.body - len(avatars)]
+        whole = own = mass[prop.first : prop.first + prop.count].sum()
+    else:
+        body = avatars[drag.body].body
+        particles = slice(body.first, body.first + body.count)
+        bones, weights = unpack(body.skin)
+        main = bones[np.arange(len(bones)), weights.argmax(axis=1)]
+        bone = main[np.linalg.norm(simulation.state.x.numpy()[env, particles] - drag.start, axis=1).argmin()]
+        name, agent = JOINT_NAMES[bone], batch.task.agent_names[drag.body]
+        target, part = simulation.receivers.find(name, drag.body), body_part_of_joint()
+        moves = np.ones(len(main), bool) if name in BODY_PARTS["torso"] else part[main] == part[bone]
+        whole, own = mass[particles][moves].sum(), mass[particles][main == bone].sum()
+    at, turn = frame_of(target, env)
+    return Grip(name, agent, target, turn.inv().apply(drag.start - at), float(whole), float(own))
+
+
+class MouseForce:
+    """Spring that pulls a grabbed point of a bone or prop to the mouse.
+
+    Its stiffness is that of the mass that moves, at natural frequency :data:`DRAG_RATE`. Its damper is critical for the
+    grabbed bone alone, because the force is constant during a control step, in which a stronger one would turn a light
+    limb around.
+    """
+
+    def __init__(self, batch: BatchEnv, env: int, push: Callable[..., None]) -> None:
+        """Drag nothing yet.
+
+        Args:
+            batch: holds the environment.
+            env: its index.
+            push: ``apply_force`` of a view of the batch.
+        """
+        self._batch, self._env, self._push = batch, env, push
+        self._drag: Drag | None = None
+        self._grip: Grip | None = None
+
+    def apply(self, drag: Drag | None) -> None:
+        """Let the force of a drag act in the next control step; none without a drag."""
+        if drag is None:
+            self._drag = self._grip = None
+            return
+        if self._grip is None or drag.start is not self._drag.start:
+            self._grip = grip_at(self._batch, self._env, drag)
+            self._before = self._grip.point(self._env)
+        self._drag, grip = drag, self._grip
+        point = grip.point(self._env)
+        velocity = (point - self._before) / self._batch.config.physics.control_dt
+        self._before = point
+        force = grip.mass * DRAG_RATE**2 * (drag.end - point) - 2.0 * grip.own_mass * DRAG_RATE * velocity
+        force *= min(1.0, MOST_DRAG * grip.mass / max(float(np.linalg.norm(force)), 1e-9))
+        self._push(grip.name, force, point, agent=grip.agent, envs=self._env)
+
+    def arrow(self) -> Arrow | None:
+        """Return an arrow from the grabbed point to the mouse, if something is dragged."""
+        from piavatar_envs.render import Arrow
+
+        if self._grip is None:
+            return None
+        point = self._grip.point(self._env)
+        return Arrow(point, self._drag.end - point)
+
+
 class Live:
     """Shows an environment in a web browser while it is simulated, at most in real time.
 
@@ -268,6 +382,7 @@ class Live:
     def __init__(
         self,
         batch: BatchEnv,
+        push: Callable[..., None],
         color: Literal["skin", "strain"] = "skin",
         port: int | None = None,
         env: int = 0,
@@ -277,6 +392,7 @@ class Live:
 
         Args:
             batch: holds the environment.
+            push: ``apply_force`` of a view of it, by which the mouse pulls.
             color: of the bodies.
             port: of this machine, or the next one that is free.
             env: index of the environment in the batch.
@@ -290,7 +406,11 @@ class Live:
         import_viser()  # so that a missing library is reported before the first reset
         self.color, self.pace = color, pace or Pace()
         self._batch, self._port, self._env = batch, PORT if port is None else port, env
-        self._progress, self._scenes = Progress(batch, env), SceneReader(batch)
+        self._progress, self._scenes, self._mouse = (
+            Progress(batch, env),
+            SceneReader(batch),
+            MouseForce(batch, env, push),
+        )
         self._view: LiveView | None = None
         self._shown, self._behind = 0.0, False
 
@@ -314,6 +434,11 @@ class Live:
         self.show()
         self.pace.begin()
 
+    def before_step(self) -> None:
+        """Let the mouse pull at what it drags, in the control step that follows."""
+        if self._view is not None:
+            self._mouse.apply(self._view.drag)
+
     def step(self, speed: float = 1.0) -> None:
         """Show the scene after a control step, and wait for the rest of its time.
 
@@ -333,7 +458,9 @@ class Live:
     def show(self) -> None:
         """Show the present scene."""
         self._shown, self._behind = self.pace.clock(), False
-        self.view.show(self._scenes.scene(self._env, self.color), self._progress.since_last())
+        scene, arrow = self._scenes.scene(self._env, self.color), self._mouse.arrow()
+        scene = replace(scene, markers=[*scene.markers, arrow]) if arrow else scene
+        self.view.show(scene, self._progress.since_last())
 
     def close(self) -> None:
         """Stop the server, if it was started; closing twice is fine.

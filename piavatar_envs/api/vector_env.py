@@ -48,7 +48,7 @@ class VectorCalls:
     _own: frozenset[str]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call ``reset``, ``render``, ``get_state``, ``set_state`` or ``assist_root`` of every environment.
+        """Call ``reset``, ``render``, ``get_state``, ``set_state``, ``assist_root`` or ``apply_force`` of each.
 
         Args:
             name: of the method; other attributes are read as by :meth:`get_attr`.
@@ -114,7 +114,7 @@ class VectorCalls:
     def call_some(self, envs: Sequence[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Call a method as :meth:`call` does, for each of ``envs``; the others go on."""
         own = {"reset": self._reset_some, "get_state": self._states, "set_state": self._set_states}
-        own |= {"render": self._frames, "assist_root": self._assist_some}
+        own |= {"render": self._frames, "assist_root": self._assist_some, "apply_force": self._push_some}
         if name in own:
             return own[name](list(envs), *args, **kwargs)
         if not callable(getattr(type(self), name, None)):
@@ -146,6 +146,7 @@ class VectorCalls:
         others = ~self._mask(envs)
         if others.any():
             self.host.check_ready("set_state")
+        state = self.host.with_forces(state)
         present, given = self.host.get_state(), {}
         for name, value in state.items():
             given[name] = np.repeat(value, self.num_envs, axis=0)
@@ -164,6 +165,10 @@ class VectorCalls:
             self.assist_root(share)
             return [None for _ in envs]
         raise ValueError("assist_root by name is for all environments; give vector.assist_root() a share for each")
+
+    def _push_some(self, envs: Sequence[int], *args: Any, **kwargs: Any) -> list[None]:
+        self.host.apply_force(*args, **kwargs, envs=self._mask(envs))
+        return [None for _ in envs]
 
     def _mask(self, envs: Sequence[int]) -> np.ndarray:
         mask = np.zeros(self.num_envs, bool)

@@ -6,8 +6,11 @@ import atexit
 import contextlib
 import io
 import math
+import re
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from types import ModuleType
 from typing import TYPE_CHECKING, TextIO
 
@@ -28,6 +31,8 @@ PORT = 8080
 _TRIES = 1000
 #: Parent of all meshes; it moves against the followed point, because browsers control their cameras themselves.
 _WORLD = "/world"
+#: Names of the meshes of a scene's bodies, with the index of the body.
+_BODY = re.compile(rf"{_WORLD}/body_(\d+)")
 _GROUND_SIZE = 40.0
 #: A warm sun, a cool sky and what the ground gives back, as in the pictures; bytes.
 _KEY_LIGHT, _SKY_LIGHT, _GROUND_LIGHT = (255, 243, 226), (216, 228, 250), (206, 186, 170)
@@ -58,12 +63,32 @@ def check_port(port: int) -> None:
         raise ValueError(f"port={port} is outside [1, {65536 - _TRIES}]")
 
 
+#: Keys held while the left button drags a body; without them the camera turns.
+DRAG_KEYS = "cmd/ctrl"
+
+
+@dataclass(frozen=True)
+class Drag:
+    """A mouse that drags a body.
+
+    Attributes:
+        body: index in the scene's bodies.
+        start: where it was grabbed, shape ``(3,)`` [m].
+        end: where the mouse is, in the plane through the grabbed point that faces the camera, shape ``(3,)`` [m].
+    """
+
+    body: int
+    start: np.ndarray
+    end: np.ndarray
+
+
 class LiveView:
     """Shows scenes in every browser that opens :attr:`url`.
 
     Attributes:
         server: the library's, for panels.
         url: address of the view.
+        drag: what a mouse drags now, or None; written by another thread.
     """
 
     def __init__(self, camera: Camera | None = None, port: int = PORT) -> None:
@@ -81,6 +106,7 @@ class LiveView:
         library = import_viser()
         self._follower = Follower(camera or Camera())
         self._nodes: dict[str, viser.MeshHandle] = {}
+        self.drag: Drag | None = None
         with _silence():
             self.server: viser.ViserServer = library.ViserServer(HOST, port, "piavatar-envs", verbose=False)
         # a page of any site could press the hidden button, so no public tunnel may be opened
@@ -147,9 +173,23 @@ class LiveView:
         """Add or update a mesh; the library sends changes only."""
         node = self._nodes.get(name)
         if node is None:
-            self._nodes[name] = self.server.scene.add_mesh_simple(name, vertices, faces, color=color)
+            self._nodes[name] = node = self.server.scene.add_mesh_simple(name, vertices, faces, color=color)
+            body = _BODY.match(name)
+            if body:
+                node.on_drag("left", modifier=DRAG_KEYS)(partial(self._follow, int(body[1])))
             return
         node.vertices, node.faces, node.color = vertices, faces, color
+
+    async def _follow(self, body: int, event: viser.SceneNodeDragEvent) -> None:
+        """Keep what the mouse drags; a coroutine, because the library runs other functions in any order."""
+        world = np.array(self._world.position)
+        end = np.array(event.end_position) - world
+        if event.phase == "end":
+            self.drag = None
+        elif event.phase == "start":
+            self.drag = Drag(body, np.array(event.start_position) - world, end)
+        elif self.drag is not None:
+            self.drag = replace(self.drag, end=end)
 
     def close(self) -> None:
         """Stop the server; closing twice is fine."""

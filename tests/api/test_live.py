@@ -11,6 +11,7 @@ import pytest
 from piavatar_envs.api.gym_env import AvatarEnv
 from piavatar_envs.api.pictures import Pace
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.render.live import Drag
 
 
 class FakeTime:
@@ -140,6 +141,30 @@ def test_not_every_step_faster_than_a_screen_is_sent(make_human, monkeypatch):
     for _ in range(40):
         env.step(np.zeros(env.action_space.shape, np.float32))
     assert 8 <= len(sent) <= 12 and sum(sent) == pytest.approx(0.2, abs=0.02)
+
+
+@pytest.mark.parametrize("body", [0, 1])
+def test_the_mouse_pulls_at_what_it_drags(make_human, body):
+    """Pull a hand, and a ball, half a metre up and to the side: the force grows with the distance, and ends."""
+    env, _ = make_human("PIAvatar/KickBall-v0", episode_seconds=2.3)
+    env.reset(seed=0)
+    live, batch, still = env.unwrapped.host.live, env.unwrapped.batch, np.zeros(env.action_space.shape, np.float32)
+    name = "left_wrist" if body == 0 else "ball"
+    target = batch.simulation.receivers.find(name)
+    start = target.frame.position.numpy()[0, target.column] + (np.array([0.05, 0.0, -0.05]) if body == 0 else 0.0)
+    end, distances = start + np.array([0.1, 0.0, 0.1 if body == 0 else 0.5]), []
+    live.view.drag = Drag(body, start, end)
+    for _ in range(8):
+        env.step(still)
+        distances.append(np.linalg.norm(live._mouse._grip.point(0) - end))
+    assert not batch.failure.numpy().any()
+    slots = {key: value[0, 0] for key, value in env.unwrapped.get_state().items() if key.startswith("forces.")}
+    assert slots["forces.target"] == target.index and slots["forces.remaining"] == 0
+    assert distances[-1] < distances[0]
+    assert any("arrow" in node for node in shown(env))
+    live.view.drag = None
+    env.step(still)
+    assert not any("arrow" in node for node in shown(env))
 
 
 def test_closing_stops_the_server(make_human):

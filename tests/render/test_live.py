@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import sys
 import urllib.request
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -123,6 +125,36 @@ def test_a_body_that_blew_up_is_shown(view, body):
     view.show(Scene([Body(vertices, body.faces)], [], follow=np.full(3, np.nan)), None)
     assert np.isfinite(handle(view, "body_0").vertices).all()
     assert np.isfinite(view.server.scene.get_handle_by_name("/world").position).all()
+
+
+class Mouse:
+    """Events of a mouse that drags a node, as the library sends them."""
+
+    def __init__(self, node):
+        self.node = node
+
+    def send(self, phase: str, start, end, modifier: str = "cmd/ctrl") -> None:
+        event = SimpleNamespace(phase=phase, start_position=tuple(start), end_position=tuple(end), target=self.node)
+        for entry in self.node._impl.drag_cb:
+            if entry.button == "left" and entry.modifier == modifier:
+                asyncio.run(entry.callback(event))
+
+
+def test_a_mouse_drags_bodies_and_nothing_else(view, body):
+    view.show(Scene([body], [Sphere((0, 0, 1), 0.1)], follow=np.array([2.0, 3.0, 0.9])), None)
+    mouse, start, end = Mouse(handle(view, "body_0")), np.array([0.1, 0.2, 1.0]), np.array([0.5, 0.2, 1.2])
+    assert view.drag is None
+    mouse.send("start", start, start)
+    mouse.send("update", start + 0.1, end)
+    assert view.drag.body == 0
+    np.testing.assert_allclose(view.drag.start, start + [2.0, 3.0, 0.0])  # the world has moved below the camera
+    np.testing.assert_allclose(view.drag.end, end + [2.0, 3.0, 0.0])
+    mouse.send("end", start, end)
+    assert view.drag is None
+    mouse.send("start", start, end, modifier=None)  # this turns the camera
+    Mouse(handle(view, "sphere_0")).send("start", start, end)
+    mouse.send("update", start, end)
+    assert view.drag is None
 
 
 def port_of(view: LiveView) -> int:
