@@ -8,14 +8,14 @@ the impulse ``F dt``:
       u_p += w_p dt (F / m + alpha x (x_p - c)),   I alpha = r x F,
 
   with the target's weight ``w_p`` in a particle (1 in a prop), its mass ``m = sum w_p m_p``, centre of mass ``c`` and
-  inertia ``I`` about it, and the arm ``r`` from there to the point. Weighted by ``w_p m_p``, this has exactly the
-  momentum ``F dt`` and the angular momentum ``r x F dt`` about ``c``, and it strains a bone's matter nowhere;
+  inertia ``I`` about it, and the arm ``r`` from there to the point. Summed with ``m_p``, this has exactly the momentum
+  ``F dt`` and the angular momentum ``r x F dt`` about ``c``;
 - to a bone under torque control as the generalised impulse ``J_b^T F dt`` with the Jacobian of the point: joint ``c``
   that carries the bone gets ``(x - p_c) x F dt``, the pelvis ``F dt``. It joins the impulses that the joints solve for
   (:func:`~piavatar_envs.avatar.torque_control.stages.apply_torques`), so that springs respond within the substep and
   carry the moment of a static load.
 
-An environment has a fixed number of slots. Nothing of this is recorded before the first force, see
+An environment has a fixed number of slots. No launch of this is recorded before the first force, see
 :meth:`~piavatar_envs.envs.batch_env.BatchEnv.enable_forces`.
 """
 
@@ -111,7 +111,7 @@ class Fields:
 
 @dataclass(frozen=True)
 class Target:
-    """What a force acts on.
+    """Bone or prop that a force acts on.
 
     Attributes:
         index: as in :class:`Slots`.
@@ -129,7 +129,7 @@ class Target:
 
 
 class Receivers:
-    """What external forces can act on: the bones of avatars, and props.
+    """Bones and props of a world, on which external forces can act.
 
     Attributes:
         avatars, controllers, props: of the world.
