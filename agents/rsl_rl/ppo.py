@@ -110,8 +110,8 @@ _TERMS: Mapping[str, tuple[tuple[float, ...], Sequence[str]]] = {
     "reference_positions": (_VECTOR, _BODY),
     "reference_root": (_ROTATION, ("root",)),
     "reference_turns": (_SPIN, _JOINTS),
-    "way_direction": (_VECTOR, ("way",)),
-    "way_offset": (_ASIDE, ("way",)),
+    "path_direction": (_VECTOR, ("path",)),
+    "path_offset": (_ASIDE, ("path",)),
     "gait_phase": (_HALF_A_STRIDE, ("clock",)),
 }
 

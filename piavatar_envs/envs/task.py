@@ -6,8 +6,9 @@ covers all environments, and nothing that a task does leaves the device.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from keyword import iskeyword
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -82,6 +83,19 @@ class TaskArray:
     drawn: tuple[Parameter, ...] = ()
 
 
+class Columns(tuple):
+    """Declared terms or metrics, whose attributes are their columns in the arrays that kernels write.
+
+    A kernel writes ``outcome.metrics[e, agent, MyTask.metrics.distance]``; Warp compiles the attribute as a constant.
+    """
+
+    def __new__(cls, declared: Iterable[Term | Metric]) -> Columns:
+        """Number the terms or metrics in their order."""
+        self = super().__new__(cls, declared)
+        vars(self).update({one.name: column for column, one in enumerate(self)})
+        return self
+
+
 class Task:
     """Base of all tasks.
 
@@ -89,7 +103,7 @@ class Task:
         Config: class of the settings.
         description: one line for listings.
         observation_terms: terms that the task adds to the observation.
-        rewards: terms of the reward, which is their sum.
+        rewards: terms of the reward, which is their sum; become :class:`Columns`, as costs and metrics do.
         costs: terms of ``info["cost"]``, for constrained learning; not part of the reward.
         metrics: other numbers in ``info``.
         state_arrays: arrays that a saved state holds.
@@ -120,9 +134,9 @@ class Task:
     Config: ClassVar[type[EnvConfig]] = EnvConfig
     description: ClassVar[str] = ""
     observation_terms: ClassVar[tuple[ObservationTerm, ...]] = ()
-    rewards: ClassVar[tuple[Term, ...]] = ()
-    costs: ClassVar[tuple[Term, ...]] = ()
-    metrics: ClassVar[tuple[Metric, ...]] = ()
+    rewards: ClassVar[tuple[Term, ...]] = Columns(())
+    costs: ClassVar[tuple[Term, ...]] = Columns(())
+    metrics: ClassVar[tuple[Metric, ...]] = Columns(())
     state_arrays: ClassVar[tuple[TaskArray, ...]] = ()
     scratch_arrays: ClassVar[tuple[TaskArray, ...]] = ()
 
@@ -147,7 +161,7 @@ class Task:
     picture_settings: ClassVar[Mapping[str, Any]] = {}
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Check the declarations and derive the names.
+        """Check the declarations and derive names and columns.
 
         Raises:
             ValueError: a declaration of another type, or a name that is no name, is given twice or is taken.
@@ -156,6 +170,7 @@ class Task:
         cls.reward_names = cls._names("rewards", Term)
         cls.cost_names = cls._names("costs", Term)
         cls.metric_names = cls._names("metrics", Metric, NAMES_OF_INFO, "info has that key anyway")
+        cls.rewards, cls.costs, cls.metrics = Columns(cls.rewards), Columns(cls.costs), Columns(cls.metrics)
         taken = (*dir(cls), "config", "joints", "scene")
         state = cls._names("state_arrays", TaskArray, taken, "the task has that attribute")
         cls._names("scratch_arrays", TaskArray, (*taken, *state), "the task has that attribute or array")
@@ -173,8 +188,10 @@ class Task:
             raise ValueError(f"{where}={declared!r} is no tuple of {kind.__name__}; write {example}")
         names = tuple(one.name for one in declared)
         for index, name in enumerate(names):
-            if not isinstance(name, str) or not name or name.startswith("_"):
-                raise ValueError(f"{where} has {name!r}; a name is a string that does not begin with an underscore")
+            if not isinstance(name, str) or not name.isidentifier() or name.startswith("_") or iskeyword(name):
+                raise ValueError(
+                    f"{where} has {name!r}; a name is an identifier that does not begin with an underscore"
+                )
             if name in names[:index]:
                 raise ValueError(f"{where} has {name!r} twice; rename one of them")
             if name in taken:

@@ -163,11 +163,11 @@ def judge_pose(
     angle /= float(count)
     off = bones.position[e, 0] - pelvis_at(rule.place, bones.body, e)
     distance = wp.length(wp.vec2(off[0], off[1]))
-    outcome.terms[e, 0, 0] = 0.6 * tolerance(angle, 0.05, rule.pose_margin)
-    outcome.terms[e, 0, 1] = 0.4 * tolerance(distance, 0.02, rule.place_margin)
-    outcome.terms[e, 0, 2] = -rule.control_cost * mean_square_action(action, e, 0)
-    outcome.metrics[e, 0, 0] = wp.degrees(angle)
-    outcome.metrics[e, 0, 1] = distance
+    outcome.terms[e, 0, DodgeTask.rewards.pose] = 0.6 * tolerance(angle, 0.05, rule.pose_margin)
+    outcome.terms[e, 0, DodgeTask.rewards.place] = 0.4 * tolerance(distance, 0.02, rule.place_margin)
+    outcome.terms[e, 0, DodgeTask.rewards.control] = -rule.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, DodgeTask.metrics.rotation_error_deg] = wp.degrees(angle)
+    outcome.metrics[e, 0, DodgeTask.metrics.root_error] = distance
 
 
 @wp.kernel
@@ -200,11 +200,11 @@ def judge_hits(
     peak = float(0.0)
     for part in range(_ABOVE_LEGS):
         peak = wp.max(peak, stress[e, 0, part])
-    outcome.cost_terms[e, 0, 0] = total / rule.impulse_scale
-    outcome.cost_terms[e, 0, 1] = wp.max(peak / rule.stress_limit - 1.0, 0.0)
-    outcome.metrics[e, 0, 2] = total
-    outcome.metrics[e, 0, 3] = peak
-    outcome.metrics[e, 0, 4] = float(hits[e])
+    outcome.cost_terms[e, 0, DodgeTask.costs.impulse] = total / rule.impulse_scale
+    outcome.cost_terms[e, 0, DodgeTask.costs.stress] = wp.max(peak / rule.stress_limit - 1.0, 0.0)
+    outcome.metrics[e, 0, DodgeTask.metrics.impulse] = total
+    outcome.metrics[e, 0, DodgeTask.metrics.stress] = peak
+    outcome.metrics[e, 0, DodgeTask.metrics.hits] = float(hits[e])
     outcome.success[e, 0] = missed
 
 

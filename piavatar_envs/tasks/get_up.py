@@ -18,7 +18,7 @@ from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.ranges import Margin, Weight
-from piavatar_envs.tasks.common.rewards import CONTROL, tolerance
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
 from piavatar_envs.tasks.common.spawn import Grounding
 from piavatar_envs.tasks.common.upright import (
     STANDING_DOC,
@@ -41,7 +41,6 @@ wp.set_module_options({"enable_backward": False})
 _HALF = wp.constant(np.pi)
 _LEFT, _RIGHT = wp.constant(joint_index("left_ankle")), wp.constant(joint_index("right_ankle"))
 _FEET_BOUND = wp.constant(0.25)
-_HELD = wp.constant(len(STANDING_METRICS))
 #: Lead of the assisted pelvis' target: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
 #: Room to each side, besides that of a fall: bodies that have got up seldom stand still at once [m].
@@ -198,11 +197,12 @@ def judge_rising(
     angle = mean_angle(bones, e)
     stands = now.high * now.straight
     high = wp.sqrt(wp.clamp(now.head, 0.0, 1.0) * wp.clamp(now.pelvis, 0.0, 1.0))
-    outcome.terms[e, 0, 0] = 0.5 * high
-    outcome.terms[e, 0, 1] = 0.2 * tolerance(feet_off(bones, e), _FEET_BOUND, feet_margin)
-    outcome.terms[e, 0, 2] = 0.15 * stands * stillness(still, speed)
-    outcome.terms[e, 0, 3] = 0.15 * stands * restfulness(still, angle)
-    write_standing(rule, now, speed, e, action, outcome)
+    outcome.terms[e, 0, GetUpTask.rewards.height] = 0.5 * high
+    outcome.terms[e, 0, GetUpTask.rewards.feet] = 0.2 * tolerance(feet_off(bones, e), _FEET_BOUND, feet_margin)
+    outcome.terms[e, 0, GetUpTask.rewards.still] = 0.15 * stands * stillness(still, speed)
+    outcome.terms[e, 0, GetUpTask.rewards.pose] = 0.15 * stands * restfulness(still, angle)
+    outcome.terms[e, 0, GetUpTask.rewards.control] = -rule.control_cost * mean_square_action(action, e, 0)
+    write_standing(rule, now, speed, e, outcome)
 
 
 @wp.kernel
@@ -219,7 +219,7 @@ def judge_hold(
     if episodes.failure[e] == 0:
         held[e] = wp.where(outcome.success[e, 0], held[e] + 1, 0)
     outcome.success[e, 0] = held[e] >= steps
-    outcome.metrics[e, 0, _HELD] = control_dt * float(held[e])
+    outcome.metrics[e, 0, GetUpTask.metrics.held_seconds] = control_dt * float(held[e])
 
 
 _STANDING = (

@@ -135,6 +135,13 @@ def to_go(box: wp.vec3, target: wp.vec3):
     return wp.vec3(target[0] - box[0], target[1] - box[1], 0.0)
 
 
+@wp.func
+def gap_to_box(push: Push, props: Props, e: int, hand: wp.vec3):
+    """Return the distance of the middle of a hand from the box's surface [m], 0 inside."""
+    at = wp.quat_rotate_inv(props.rotation[e, push.box], hand - props.position[e, push.box])
+    return wp.max(solid_distance(BOX, push.box_half_size, at)[3], 0.0)
+
+
 @wp.kernel
 def judge(
     push: Push,
@@ -150,20 +157,18 @@ def judge(
     """Reward a box near its target and hands near the box."""
     e = wp.tid()
     distance = wp.length(to_go(props.position[e, push.box], target[e]))
-    near = float(0.0)
-    for hand in range(2):
-        p = wp.quat_rotate_inv(props.rotation[e, push.box], hands[e, hand] - props.position[e, push.box])
-        gap = wp.max(solid_distance(BOX, push.box_half_size, p)[3], 0.0)
-        near += 0.5 * tolerance(gap, 0.1, push.hand_margin)
-        outcome.metrics[e, 0, 1 + hand] = gap
-    outcome.terms[e, 0, 0] = 0.8 * tolerance(
+    left, right = gap_to_box(push, props, e, hands[e, 0]), gap_to_box(push, props, e, hands[e, 1])
+    near = 0.5 * (tolerance(left, 0.1, push.hand_margin) + tolerance(right, 0.1, push.hand_margin))
+    outcome.terms[e, 0, PushBoxTask.rewards.push] = 0.8 * tolerance(
         distance, push.target_radius, wp.max(way[e] - push.target_radius, LEAST_MARGIN)
     )
-    outcome.terms[e, 0, 1] = 0.2 * near
-    outcome.terms[e, 0, 2] = -push.control_cost * mean_square_action(action, e, 0)
-    outcome.metrics[e, 0, 0] = distance
-    outcome.metrics[e, 0, 3] = wp.length(props.velocity[e, push.box])
-    outcome.metrics[e, 0, 4] = wp.length(sensors.pair_impulse[e, push.pair])
+    outcome.terms[e, 0, PushBoxTask.rewards.hands] = 0.2 * near
+    outcome.terms[e, 0, PushBoxTask.rewards.control] = -push.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, PushBoxTask.metrics.distance] = distance
+    outcome.metrics[e, 0, PushBoxTask.metrics.left_hand_gap] = left
+    outcome.metrics[e, 0, PushBoxTask.metrics.right_hand_gap] = right
+    outcome.metrics[e, 0, PushBoxTask.metrics.box_speed] = wp.length(props.velocity[e, push.box])
+    outcome.metrics[e, 0, PushBoxTask.metrics.push_impulse] = wp.length(sensors.pair_impulse[e, push.pair])
     outcome.success[e, 0] = distance <= push.target_radius
 
 
@@ -211,7 +216,7 @@ class PushBoxTask(Task):
     """Push the box to the target."""
 
     Config = PushBoxConfig
-    description = "walk up to a soft box of 5 to 20 kg and push it to a place on the floor"
+    description = "walk up to a soft box and push it to a place on the floor"
     observation_terms = (
         ObservationTerm("target_position", 3, "m", "root", "the target from the pelvis"),
         ObservationTerm("target_from_box", 3, "m", "root", "the target from the box, horizontally"),

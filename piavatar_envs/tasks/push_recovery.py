@@ -46,7 +46,6 @@ BALL = "ball"
 _BALL, _SUBJECT = wp.constant(0), wp.constant(1)
 #: Index of the first throw in the stream of the ball, after the draw of its mass.
 _THROWS = wp.constant(2)
-_FIRST_METRIC = wp.constant(len(STANDING_METRICS))
 
 
 class PushRecoveryConfig(EnvConfig):
@@ -135,9 +134,9 @@ def judge_push(
     impulse = sensors.pair_impulse[e, _SUBJECT]
     push[e] = push[e] + impulse
     strongest[e] = wp.max(strongest[e], wp.length(push[e]))
-    outcome.metrics[e, 0, _FIRST_METRIC] = wp.length(impulse)
-    outcome.metrics[e, 0, _FIRST_METRIC + 1] = wp.length(push[e])
-    outcome.metrics[e, 0, _FIRST_METRIC + 2] = strongest[e]
+    outcome.metrics[e, 0, PushRecoveryTask.metrics.impulse] = wp.length(impulse)
+    outcome.metrics[e, 0, PushRecoveryTask.metrics.push_impulse] = wp.length(push[e])
+    outcome.metrics[e, 0, PushRecoveryTask.metrics.strongest_push] = strongest[e]
     outcome.success[e, 0] = outcome.success[e, 0] and strongest[e] >= least
 
 
@@ -166,7 +165,7 @@ class PushRecoveryTask(StandingTask):
     """Stand still in the rest pose under pushes."""
 
     Config = PushRecoveryConfig
-    description = "keep balance while soft balls of 0.5 to 8 kg push from any side"
+    description = "keep balance while thrown soft balls push from any side"
     observation_terms = (
         *UPRIGHT_TERMS,
         ObservationTerm("ball_position", 3, "m", "root", "the ball, from its throw until it is caught; else zeros"),
@@ -188,10 +187,10 @@ class PushRecoveryTask(StandingTask):
     summary = """The avatar stands by the strength of its own joints, as in Stand. Once in every `throw_interval`, at a
 random moment of its first half, a soft ball is thrown at its trunk, between pelvis and chest, from a random direction
 and `throw_distance` away. The ball keeps its mass for an episode; it is drawn from `ball_mass`, uniformly in its
-logarithm. The heaviest ball at the greatest speed carries 40 N s, which would set the whole body in motion at half a
-metre a second. The ball is observed while it flies, its mass is not. It pushes by contact like anything else and may
-come to lie in front of the feet; a ball that has flown past is caught and waits. `info["strongest_push"]` is the
-greatest impulse of the episode so far: sorted by it, episodes show which pushes the avatar survives."""
+logarithm. By default, the heaviest ball at the greatest speed carries 40 N s, which would set the whole body in motion
+at half a metre a second. The ball is observed while it flies, its mass is not. It pushes by contact like anything else
+and may come to lie in front of the feet; a ball that has flown past is caught and waits. `info["strongest_push"]` is
+the greatest impulse of the episode so far: sorted by it, episodes show which pushes the avatar survives."""
     success_doc = f"{STANDING_DOC}, and a throw has pushed with at least `hit_impulse`"
     picture_seconds = 0.47
     picture_actions = "zero"

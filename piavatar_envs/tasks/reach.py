@@ -1,4 +1,4 @@
-"""Reach: bring either hand to a target that moves on a sphere around the body."""
+"""Reach: move either hand to a target that moves on a sphere around the body."""
 
 from __future__ import annotations
 
@@ -28,8 +28,6 @@ BELOW, ABOVE = wp.constant(-0.7), wp.constant(0.9)  # its least and greatest ele
 SLOWEST = wp.constant(0.3)  # least bound of the target's speed over `target_speed` [-]
 TURN = wp.constant(6.2831853)  # a whole turn [rad]
 CHEST = wp.constant(joint_index("spine3"))  # at the centre of the target's sphere
-#: Columns of ``outcome.terms``, in the order of ``ReachTask.rewards``.
-TERM_REACH, TERM_CONTROL = map(wp.constant, range(2))
 COURSE = (
     Parameter("target_azimuth", "rad", -SIDE, SIDE, "middle of the swing, from the front"),
     Parameter("target_elevation", "rad", BELOW, ABOVE, "middle of the swing, upwards"),
@@ -116,11 +114,11 @@ def judge(
     left = wp.length(flesh_middle(bones, e, LEFT_WRIST) - goal)
     right = wp.length(flesh_middle(bones, e, RIGHT_WRIST) - goal)
     distance = wp.min(left, right)
-    outcome.terms[e, 0, TERM_REACH] = tolerance(distance, target.target_radius, target.margin)
-    outcome.terms[e, 0, TERM_CONTROL] = -target.control_cost * mean_square_action(action, e, 0)
-    outcome.metrics[e, 0, 0] = distance
-    outcome.metrics[e, 0, 1] = left
-    outcome.metrics[e, 0, 2] = right
+    outcome.terms[e, 0, ReachTask.rewards.reach] = tolerance(distance, target.target_radius, target.margin)
+    outcome.terms[e, 0, ReachTask.rewards.control] = -target.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, ReachTask.metrics.distance] = distance
+    outcome.metrics[e, 0, ReachTask.metrics.left_distance] = left
+    outcome.metrics[e, 0, ReachTask.metrics.right_distance] = right
     outcome.success[e, 0] = distance <= target.target_radius
 
 
@@ -148,10 +146,10 @@ def observe(
 
 
 class ReachTask(Task):
-    """Bring either hand to the target and stay with it."""
+    """Move either hand to the target and keep it there."""
 
     Config = ReachConfig
-    description = "bring either hand to a target that moves on a sphere around the body"
+    description = "move either hand to a target that moves on a sphere around the body"
     observation_terms = (
         ObservationTerm("target_position", 3, "m", "root", "the target from the pelvis"),
         ObservationTerm("target_velocity", 3, "m/s", "root", "velocity of the target"),
@@ -171,8 +169,8 @@ class ReachTask(Task):
     scratch_arrays = (TaskArray("goal", wp.vec3),)
 
     summary = """A target swings on a sphere of `radius` about the chest, in front of the body or beside it, at up to
-0.7 of `target_speed`. The avatar stands upright, its joints slightly bent at random (`pose_noise`). A good agent brings
-the middle of either hand to the target and stays with it."""
+0.7 of `target_speed`. The avatar stands upright, its joints slightly bent at random (`pose_noise`). A good agent moves
+the middle of either hand to the target and keeps it there."""
     success_doc = "`distance` is at most `target_radius`"
     picture_seconds = 1.0
     picture_actions: ClassVar[Mapping[str, float]] = {

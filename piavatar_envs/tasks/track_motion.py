@@ -242,13 +242,13 @@ def judge(
     for b in range(count):
         distance += wp.length(bones.position[e, b] - clip_position[e, b]) / float(count)
         angle += wp.length(quat_log(wp.quat_inverse(clip_rotation[e, b]) * bones.local[e, b])) / float(count)
-    outcome.terms[e, 0, 0] = 0.6 * tolerance(distance, 0.01, 0.3)
-    outcome.terms[e, 0, 1] = 0.4 * tolerance(angle, 0.01, 0.5)
-    outcome.terms[e, 0, 2] = -clip.control_cost * mean_square_action(action, e, 0)
-    outcome.metrics[e, 0, 0] = distance
-    outcome.metrics[e, 0, 1] = wp.degrees(angle)
-    outcome.metrics[e, 0, 2] = wp.length(bones.position[e, 0] - clip_position[e, 0])
-    outcome.metrics[e, 0, 3] = wp.length(impulse[e])
+    outcome.terms[e, 0, TrackMotionTask.rewards.position] = 0.6 * tolerance(distance, 0.01, 0.3)
+    outcome.terms[e, 0, TrackMotionTask.rewards.rotation] = 0.4 * tolerance(angle, 0.01, 0.5)
+    outcome.terms[e, 0, TrackMotionTask.rewards.control] = -clip.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, TrackMotionTask.metrics.mpjpe] = distance
+    outcome.metrics[e, 0, TrackMotionTask.metrics.rotation_error_deg] = wp.degrees(angle)
+    outcome.metrics[e, 0, TrackMotionTask.metrics.root_error] = wp.length(bones.position[e, 0] - clip_position[e, 0])
+    outcome.metrics[e, 0, TrackMotionTask.metrics.impulse] = wp.length(impulse[e])
     outcome.success[e, 0] = distance <= clip.success_distance
     outcome.terminated[e, 0] = distance > clip.fail_distance
 

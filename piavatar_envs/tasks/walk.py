@@ -39,13 +39,14 @@ from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tole
 from piavatar_envs.tasks.common.spawn import Grounding, forward_of, pelvis_at, record_standing
 from piavatar_envs.tasks.common.upright import (
     FALL_DOC,
-    STANDING_METRICS,
+    POSTURE_METRICS,
     UPRIGHT_TERMS,
     Upright,
     UprightConfig,
     posture_of,
     record_observe_upright,
     tilt_of,
+    upright_rewards,
     write_posture,
 )
 
@@ -55,8 +56,6 @@ wp.set_module_options({"enable_backward": False})
 FASTEST = 1.5
 #: Pace: share of the target speed that success requires.
 _PACE = wp.constant(0.9)
-#: Columns of ``outcome.terms``, in the order of ``WalkTask.rewards``.
-TERM_SPEED, TERM_GAIT, TERM_HEADING, TERM_HEIGHT, TERM_UPRIGHT, TERM_CONTROL, TERM_POSTURE = map(wp.constant, range(7))
 
 
 class WalkConfig(EnvConfig):
@@ -135,18 +134,18 @@ def judge_walk(
         stride = load_score * (0.5 + 0.5 * step_reward(path.gait, episodes.step_count[e], bones, e, ahead))
     hips_straight = tolerance(tilt_of(bones.rotation[e, 0]), 0.1, upright.tilt_margin)
     fast = now.high * tolerance(wp.abs(speed - path.target_speed), 0.1 * path.target_speed, path.target_speed)
-    outcome.terms[e, 0, TERM_SPEED] = (0.7 - path.gait.weight) * fast
-    outcome.terms[e, 0, TERM_GAIT] = path.gait.weight * now.high * stride * hips_straight
-    outcome.terms[e, 0, TERM_HEADING] = 0.1 * now.high * tolerance(heading_error, 0.1, path.heading_margin)
-    outcome.terms[e, 0, TERM_HEIGHT] = 0.1 * now.high
-    outcome.terms[e, 0, TERM_UPRIGHT] = 0.1 * now.straight
-    outcome.terms[e, 0, TERM_CONTROL] = -upright.control_cost * mean_square_action(action, e, 0)
+    outcome.terms[e, 0, WalkTask.rewards.speed] = (0.7 - path.gait.weight) * fast
+    outcome.terms[e, 0, WalkTask.rewards.gait] = path.gait.weight * now.high * stride * hips_straight
+    outcome.terms[e, 0, WalkTask.rewards.heading] = 0.1 * now.high * tolerance(heading_error, 0.1, path.heading_margin)
+    outcome.terms[e, 0, WalkTask.rewards.height] = 0.1 * now.high
+    outcome.terms[e, 0, WalkTask.rewards.upright] = 0.1 * now.straight
+    outcome.terms[e, 0, WalkTask.rewards.control] = -upright.control_cost * mean_square_action(action, e, 0)
     if path.gait.posture_cost > 0.0:
-        outcome.terms[e, 0, TERM_POSTURE] = -path.gait.posture_cost * posture_excess(path.gait, bones, e)
+        outcome.terms[e, 0, WalkTask.rewards.posture] = -path.gait.posture_cost * posture_excess(path.gait, bones, e)
     write_posture(now, e, outcome)
-    outcome.metrics[e, 0, 3] = speed
-    outcome.metrics[e, 0, 4] = mean_speed
-    outcome.metrics[e, 0, 5] = distance
+    outcome.metrics[e, 0, WalkTask.metrics.speed] = speed
+    outcome.metrics[e, 0, WalkTask.metrics.mean_speed] = mean_speed
+    outcome.metrics[e, 0, WalkTask.metrics.distance] = distance
     standing = now.head >= upright.stand_head
     outcome.success[e, 0] = standing and mean_speed >= _PACE * path.target_speed and distance >= path.target_speed
     fallen = is_down(wp.vec2(now.head, now.pelvis), path.least)
@@ -179,11 +178,11 @@ class WalkTask(Task):
     """Walk straight ahead."""
 
     Config = WalkConfig
-    description = "walk straight ahead at 1 m/s by the strength of the joints"
+    description = "walk straight ahead at a given speed by the strength of the joints"
     observation_terms = (
         *UPRIGHT_TERMS,
-        ObservationTerm("way_direction", 3, "-", "root", "direction of the path: a unit vector"),
-        ObservationTerm("way_offset", 1, "m", "world", "distance of the pelvis from the path, to the left"),
+        ObservationTerm("path_direction", 3, "-", "root", "direction of the path: a unit vector"),
+        ObservationTerm("path_offset", 1, "m", "world", "distance of the pelvis from the path, to the left"),
     )
     rewards = (
         Term(
@@ -197,21 +196,12 @@ class WalkTask(Task):
             "0.1 while the pelvis faces along the path within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
             "after another `heading_margin`; all times `height` / 0.1",
         ),
-        Term(
-            "height",
-            "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has "
-            "fallen to 0.01 after another `upright.height_margin` of that height",
-        ),
-        Term(
-            "upright",
-            "0.1 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after another "
-            "`upright.tilt_margin`",
-        ),
+        *upright_rewards(0.1),
         CONTROL,
         POSTURE_COST,
     )
     metrics = (
-        *STANDING_METRICS[:3],
+        *POSTURE_METRICS,
         Metric("speed", "m/s", "speed of the pelvis ahead"),
         Metric("mean_speed", "m/s", "distance over the time of the episode so far"),
         Metric("distance", "m", "distance that the pelvis has come ahead"),

@@ -88,6 +88,6 @@ def test_mirrored_actions_have_mirrored_consequences(control, settings, before, 
         off = float((mirrored - expected)[term.slice].norm())
         # the points of so small a body are not quite symmetric
         assert off < 5.0e-4 + 0.05 * float(expected[term.slice].norm()), name
-        if name in ("joint_rotations", "joint_velocities", "bone_velocities", "root_spin", "way_offset"):
+        if name in ("joint_rotations", "joint_velocities", "bone_velocities", "root_spin", "path_offset"):
             assert off < 0.1 * float((mirrored - seen)[term.slice].norm()), name
     episodes.close()

@@ -28,7 +28,7 @@ GAME = "sumo_v0"
 UNBOUNDED = r"Agent's (minimum|maximum) observation space value is -?infinity.*"
 
 #: Terms that need a touch, an agent that leaves or a pass to change; they are tested where that happens.
-RARE = ("contact_impulse", "others_in", "turn", "touched", "way")
+RARE = ("contact_impulse", "others_in", "passer", "touched", "ball_travel")
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ class Kicker:
         hips = {f"{side}_hip.x": lifted[side] / 0.15 for side in thighs}
         ball = facing = seen["ball_position"][:2]
         move = seen["place"][:2] / 0.2
-        if seen["turn"][0]:
+        if seen["passer"][0]:
             facing = seen["other_0_position"][:2] - ball
             # the change of velocity that sends it there
             way = self.SPEED * facing / np.linalg.norm(facing) - seen["ball_velocity"][:2]
@@ -108,7 +108,7 @@ def test_a_ball_that_is_kicked_on_arrives(circle):
             assert metrics[env, :, 3] == pytest.approx(np.full(3, np.linalg.norm(ball_of(circle, env)[1])), abs=2e-4)
             for agent in range(3):
                 seen = circle.layout.split(circle.observation.numpy()[env, agent])
-                assert np.argmax(seen["turn"]) == (passer[env] - agent) % 3 and seen["turn"].sum() == 1.0
+                assert np.argmax(seen["passer"]) == (passer[env] - agent) % 3 and seen["passer"].sum() == 1.0
                 assert seen["touched"] == touched[env]
         over |= circle.terminated.numpy().any(1)
     assert (passes >= 1).sum() >= 3, "the script must get it across"
@@ -269,7 +269,7 @@ def test_any_number_stands_around_the_circle(make_game, play, agents):
     neighbours = np.linalg.norm(at - np.roll(at, -1, axis=0), axis=1)
     assert len(game.possible_agents) == agents and neighbours == pytest.approx(np.full(agents, 1.4), abs=0.15)
     seen = game.observation_layout.split(game.batch.observation.numpy()[0, 0])
-    assert seen["turn"].shape == (agents,)
+    assert seen["passer"].shape == (agents,)
     for at_agent, avatar in zip(at, game.batch.simulation.avatars, strict=True):
         facing = Rotation.from_quat(avatar.tracked.rotation.numpy()[0, 0]).apply([0.0, -1.0, 0.0])
         assert facing @ (-at_agent * [1, 1, 0]) / np.linalg.norm(at_agent[:2]) > 0.99

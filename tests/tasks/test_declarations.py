@@ -11,6 +11,10 @@ from piavatar_envs.config import EnvConfig, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.task import NAMES_OF_INFO, Metric, Task, TaskArray, Term
 from piavatar_envs.tasks.common.spawn import record_standing
+from piavatar_envs.tasks.common.upright import POSTURE_METRICS, StandingTask
+from piavatar_envs.tasks.get_up import GetUpTask
+from piavatar_envs.tasks.push_recovery import PushRecoveryTask
+from piavatar_envs.tasks.walk import WalkTask
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,6 +69,8 @@ def made(**declared) -> Task:
         ("metrics", (Metric("off"), Metric("off")), "'off'"),
         ("metrics", (Metric("off"), Metric("success")), "'success'"),
         ("metrics", (Metric("_off"),), "'_off'"),
+        ("rewards", (Term("left hand"),), "'left hand'"),
+        ("rewards", (Term("pass"),), "'pass'"),
         ("rewards", (Term(1),), "1"),
         ("rewards", ("near",), "'near'.* Term"),
         ("rewards", "near", "'near'.* Term"),
@@ -82,6 +88,39 @@ def test_a_name_is_declared_once_but_may_be_a_reward_and_a_metric():
         made(state_arrays=(TaskArray("goal"),), scratch_arrays=(TaskArray("goal"),))
     task = made(rewards=(Term("near"), Term("success")), metrics=(Metric("near"),))
     assert task.reward_names == ("near", "success") and task.metric_names == ("near",) and task.cost_names == ("hits",)
+
+
+@wp.kernel
+def write_named(terms: wp.array3d(dtype=float), costs: wp.array3d(dtype=float), out: wp.array3d(dtype=float)):
+    e = wp.tid()
+    terms[e, 0, Named.rewards.near] = 1.0
+    terms[e, 0, Named.rewards.count] = 2.0
+    costs[e, 0, Named.costs.hits] = 3.0
+    out[e, 0, Named.metrics.near] = 4.0
+
+
+class Named(Plain):
+    """Writes columns by the names that it declares; one of them is a method of tuples."""
+
+    rewards = (Term("control"), Term("count"), Term("near"))
+    metrics = (Metric("off"), Metric("near"))
+
+    def record_outcome(self, env, graph):
+        graph.launch(write_named, env.num_envs, [env.terms, env.cost_terms, env.metrics])
+
+
+def test_a_kernel_writes_the_columns_that_it_names(device):
+    batch = BatchEnv(Named(load_config(Named.Config, None, {"fidelity": "tiny"})), 1, device)
+    batch.reset(seeds=[0])
+    batch.step()
+    assert batch.terms.numpy()[0, 0].tolist() == [0.0, 2.0, 1.0]
+    assert batch.cost_terms.numpy()[0, 0].tolist() == [3.0] and batch.metrics.numpy()[0, 0].tolist() == [0.0, 4.0]
+
+
+@pytest.mark.parametrize("task", [WalkTask, GetUpTask, PushRecoveryTask])
+def test_shared_metrics_have_the_columns_of_a_standing_task(task):
+    shared = StandingTask.metrics if task is not WalkTask else POSTURE_METRICS
+    assert task.metrics[: len(shared)] == shared == StandingTask.metrics[: len(shared)]
 
 
 @wp.kernel

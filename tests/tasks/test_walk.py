@@ -45,8 +45,8 @@ def test_walking_is_measured_along_the_way(make_env, avatar):
     yaw, place = (0.0, np.zeros(2)) if avatar is None else (2.0, np.array([0.4, -0.2]))
     ahead = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     observation, _ = env.reset(seed=0)
-    assert pelvis(env)[1].apply(seen(env, observation, "way_direction")) == pytest.approx(ahead, abs=1e-5)
-    assert seen(env, observation, "way_offset") == pytest.approx(0.0, abs=1e-4)
+    assert pelvis(env)[1].apply(seen(env, observation, "path_direction")) == pytest.approx(ahead, abs=1e-5)
+    assert seen(env, observation, "path_offset") == pytest.approx(0.0, abs=1e-4)
     drift(env, ahead)
     for step in range(36):
         _, _, terminated, _, info = env.step(still(env))
@@ -97,7 +97,7 @@ def test_leaving_the_way_is_the_end(make_env, velocity):
     steps, terminated = 0, False
     while not terminated and steps < 18:
         observation, _, terminated, _, info = env.step(still(env))
-        aside = abs(seen(env, observation, "way_offset")[0])
+        aside = abs(seen(env, observation, "path_offset")[0])
         assert terminated == (aside > np.float32(0.3) or info["distance"] > 0.9)
         steps += 1
     assert terminated and 5 < steps < 14

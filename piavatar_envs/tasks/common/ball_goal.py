@@ -190,19 +190,17 @@ def judge_ball(
     spare = 0.5 * gate.target_radius
     miss = closest_pass(center, position[e], velocity[e], gate.gravity, gate.ball_radius)
     promise = 1.0 - wp.clamp((miss - spare) / wp.max(course.length[e] - spare, 1.0e-3), 0.0, 1.0)
-    outcome.terms[e, 0, 0] = 0.0
-    outcome.terms[e, 0, 1] = 0.0
-    if best[0] >= 0.0:
-        outcome.terms[e, 0, 0] = APPROACH * wp.max(approach - best[0], 0.0)
-        outcome.terms[e, 0, 1] = AIM * wp.max(promise - best[1], 0.0)
+    known = best[0] >= 0.0
+    outcome.terms[e, 0, GateTask.rewards.approach] = wp.where(known, APPROACH * wp.max(approach - best[0], 0.0), 0.0)
+    outcome.terms[e, 0, GateTask.rewards.aim] = wp.where(known, AIM * wp.max(promise - best[1], 0.0), 0.0)
     course.best[e] = wp.vec2(wp.max(approach, best[0]), wp.max(promise, best[1]))
-    outcome.terms[e, 0, 2] = 0.0
+    outcome.terms[e, 0, GateTask.rewards.goal] = 0.0
     if passes(center, course.forward[e], gate.target_radius, course.last[e], position[e]):
         if not outcome.success[e, 0]:
-            outcome.terms[e, 0, 2] = GOAL
+            outcome.terms[e, 0, GateTask.rewards.goal] = GOAL
         outcome.success[e, 0] = True
         outcome.terminated[e, 0] = True
-    outcome.terms[e, 0, 3] = -gate.control_cost * mean_square_action(action, e, 0)
+    outcome.terms[e, 0, GateTask.rewards.control] = -gate.control_cost * mean_square_action(action, e, 0)
     course.last[e] = position[e]
 
 
@@ -220,10 +218,10 @@ def measure_ball(
 ):
     """Write ``GateTask.metrics``; ``pair`` is the sensor of the ball on the avatar."""
     e = wp.tid()
-    outcome.metrics[e, 0, 0] = wp.length(velocity[e])
-    outcome.metrics[e, 0, 1] = wp.length(course.center[e] - position[e])
-    outcome.metrics[e, 0, 2] = density[e] * gate.ball_volume
-    outcome.metrics[e, 0, 3] = wp.length(sensors.pair_impulse[e, pair])
+    outcome.metrics[e, 0, GateTask.metrics.ball_speed] = wp.length(velocity[e])
+    outcome.metrics[e, 0, GateTask.metrics.distance_to_target] = wp.length(course.center[e] - position[e])
+    outcome.metrics[e, 0, GateTask.metrics.ball_mass] = density[e] * gate.ball_volume
+    outcome.metrics[e, 0, GateTask.metrics.contact_impulse] = wp.length(sensors.pair_impulse[e, pair])
 
 
 @wp.kernel

@@ -35,17 +35,23 @@ UPRIGHT_TERMS = (
         "foot_impulses", 2, "N s", "-", "shares of left and right foot in the ground's upward impulse of the last step"
     ),
 )
+
+
+def upright_rewards(weight: float) -> tuple[Term, Term]:
+    """Return the terms of :func:`posture_of`, height and tilt, each worth ``weight`` at most."""
+    fallen = f"a Gaussian that has fallen to {0.1 * weight:g} after another"
+    return (
+        Term(
+            "height",
+            f"{weight} while the head is no lower than 0.95 of its height in the rest pose; below it {fallen} "
+            "`upright.height_margin` of that height",
+        ),
+        Term("upright", f"{weight} while the chest tilts by at most 0.1 rad; beyond it {fallen} `upright.tilt_margin`"),
+    )
+
+
 STANDING_REWARDS = (
-    Term(
-        "height",
-        "0.3 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has fallen "
-        "to 0.03 after another `upright.height_margin` of that height",
-    ),
-    Term(
-        "upright",
-        "0.3 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.03 after another "
-        "`upright.tilt_margin`",
-    ),
+    *upright_rewards(0.3),
     Term(
         "still",
         "0.2 while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to 0.02 after another "
@@ -58,12 +64,14 @@ STANDING_REWARDS = (
     ),
     CONTROL,
 )
-STANDING_METRICS = (
+#: Metrics of :func:`write_posture`; other metrics of a task follow them.
+POSTURE_METRICS = (
     Metric("head_height", "-", "height of the head joint over that in the rest pose"),
     Metric("pelvis_height", "-", "height of the pelvis joint over that in the rest pose"),
     Metric("tilt_deg", "deg", "angle of the chest from the vertical, relative to the rest pose"),
-    Metric("speed", "m/s", "speed of the pelvis"),
 )
+#: Metrics of :func:`write_standing`, likewise.
+STANDING_METRICS = (*POSTURE_METRICS, Metric("speed", "m/s", "speed of the pelvis"))
 STANDING_DOC = "the head is no lower than `upright.stand_head` of its height in the rest pose"
 FALL_DOC = f"the avatar falls: {FALLEN_DOC}"
 
@@ -147,10 +155,10 @@ def mean_angle(bones: Bones, e: int):
 
 @wp.func
 def write_posture(now: Posture, e: int, outcome: Outcome):
-    """Write the first three of :data:`STANDING_METRICS`."""
-    outcome.metrics[e, 0, 0] = now.head
-    outcome.metrics[e, 0, 1] = now.pelvis
-    outcome.metrics[e, 0, 2] = wp.degrees(now.tilt)
+    """Write :data:`POSTURE_METRICS`."""
+    outcome.metrics[e, 0, StandingTask.metrics.head_height] = now.head
+    outcome.metrics[e, 0, StandingTask.metrics.pelvis_height] = now.pelvis
+    outcome.metrics[e, 0, StandingTask.metrics.tilt_deg] = wp.degrees(now.tilt)
 
 
 @wp.func
@@ -166,13 +174,10 @@ def restfulness(still: Still, angle: float):
 
 
 @wp.func
-def write_standing(
-    rule: Upright, now: Posture, speed: float, e: int, action: wp.array3d(dtype=float), outcome: Outcome
-):
-    """Write :data:`STANDING_METRICS`, success, and the last reward term, the cost of acting."""
-    outcome.terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
+def write_standing(rule: Upright, now: Posture, speed: float, e: int, outcome: Outcome):
+    """Write :data:`STANDING_METRICS` and success."""
     write_posture(now, e, outcome)
-    outcome.metrics[e, 0, 3] = speed
+    outcome.metrics[e, 0, StandingTask.metrics.speed] = speed
     outcome.success[e, 0] = now.head >= rule.stand_head
 
 
@@ -190,11 +195,12 @@ def judge_standing(
     now = posture_of(rule, bones, e)
     speed = wp.length(bones.velocity[e, 0])
     angle = mean_angle(bones, e)
-    outcome.terms[e, 0, 0] = 0.3 * now.high
-    outcome.terms[e, 0, 1] = 0.3 * now.straight
-    outcome.terms[e, 0, 2] = 0.2 * now.high * stillness(still, speed)
-    outcome.terms[e, 0, 3] = 0.2 * now.high * restfulness(still, angle)
-    write_standing(rule, now, speed, e, action, outcome)
+    outcome.terms[e, 0, StandingTask.rewards.height] = 0.3 * now.high
+    outcome.terms[e, 0, StandingTask.rewards.upright] = 0.3 * now.straight
+    outcome.terms[e, 0, StandingTask.rewards.still] = 0.2 * now.high * stillness(still, speed)
+    outcome.terms[e, 0, StandingTask.rewards.pose] = 0.2 * now.high * restfulness(still, angle)
+    outcome.terms[e, 0, StandingTask.rewards.control] = -rule.control_cost * mean_square_action(action, e, 0)
+    write_standing(rule, now, speed, e, outcome)
 
 
 @wp.func

@@ -169,6 +169,7 @@ def judge(
     e, agent = wp.tid()
     others = others_in(episodes, out, e, agent)
     won = has_won(episodes, out, e, agent, others)
+    down = out[e, agent] and episodes.failure[e] == 0
     hit = float(0.0)
     taken = float(0.0)
     given_impulse = float(0.0)
@@ -178,14 +179,14 @@ def judge(
         taken += points[e, other, agent]
         given_impulse = wp.max(given_impulse, wp.max(impulse[e, agent, other]))
         taken_impulse = wp.max(taken_impulse, wp.max(impulse[e, other, agent]))
-    outcome.terms[e, agent, 0] = hit
-    outcome.terms[e, agent, 1] = -rules.taken_weight * taken
-    outcome.terms[e, agent, 2] = wp.where(won, rules.win_reward, 0.0)
-    outcome.terms[e, agent, 3] = wp.where(out[e, agent] and episodes.failure[e] == 0, -rules.down_cost, 0.0)
-    outcome.terms[e, agent, 4] = -rules.control_cost * mean_square_action(action, e, agent)
-    outcome.metrics[e, agent, 0] = score[e, agent]
-    outcome.metrics[e, agent, 1] = given_impulse
-    outcome.metrics[e, agent, 2] = taken_impulse
+    outcome.terms[e, agent, BoxingTask.rewards.hit] = hit
+    outcome.terms[e, agent, BoxingTask.rewards.taken] = -rules.taken_weight * taken
+    outcome.terms[e, agent, BoxingTask.rewards.win] = wp.where(won, rules.win_reward, 0.0)
+    outcome.terms[e, agent, BoxingTask.rewards.down] = wp.where(down, -rules.down_cost, 0.0)
+    outcome.terms[e, agent, BoxingTask.rewards.control] = -rules.control_cost * mean_square_action(action, e, agent)
+    outcome.metrics[e, agent, BoxingTask.metrics.score] = score[e, agent]
+    outcome.metrics[e, agent, BoxingTask.metrics.given_impulse] = given_impulse
+    outcome.metrics[e, agent, BoxingTask.metrics.taken_impulse] = taken_impulse
     # `step_count` is incremented after the outcome
     gong = episodes.step_count[e] + 1 >= rules.max_steps and episodes.failure[e] == 0 and not out[e, agent]
     outcome.success[e, agent] = won or (gong and leads(episodes, score, e, agent))

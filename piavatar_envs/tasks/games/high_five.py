@@ -120,14 +120,15 @@ def judge(
     done = placed and impulse >= least[e] and not too_hard
     to_go = distance + wp.max(rule.least_height - height, 0.0) + 0.5 * _TURN * wp.max(rule.upright - upright, 0.0)
     control = 0.5 * (mean_square_action(action, e, 0) + mean_square_action(action, e, 1))
+    near = tolerance(to_go, rule.reach, rule.margin)
     for agent in range(2):
-        outcome.terms[e, agent, 0] = rule.approach_weight * tolerance(to_go, rule.reach, rule.margin)
-        outcome.terms[e, agent, 1] = wp.where(done, rule.slap_bonus, 0.0)
-        outcome.terms[e, agent, 2] = -rule.control_cost * control
-        outcome.metrics[e, agent, 0] = distance
-        outcome.metrics[e, agent, 1] = height
-        outcome.metrics[e, agent, 2] = upright
-        outcome.metrics[e, agent, 3] = impulse
+        outcome.terms[e, agent, HighFiveTask.rewards.approach] = rule.approach_weight * near
+        outcome.terms[e, agent, HighFiveTask.rewards.slap] = wp.where(done, rule.slap_bonus, 0.0)
+        outcome.terms[e, agent, HighFiveTask.rewards.control] = -rule.control_cost * control
+        outcome.metrics[e, agent, HighFiveTask.metrics.distance] = distance
+        outcome.metrics[e, agent, HighFiveTask.metrics.hand_height] = height
+        outcome.metrics[e, agent, HighFiveTask.metrics.hand_upright] = upright
+        outcome.metrics[e, agent, HighFiveTask.metrics.slap_impulse] = impulse
         outcome.success[e, agent] = done
         # a second chance after too hard a blow would make the upper bound a matter of patience
         outcome.terminated[e, agent] = done or too_hard

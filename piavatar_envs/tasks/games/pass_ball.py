@@ -187,13 +187,14 @@ def judge(
     slow = flat_distance(velocity[e], wp.vec3()) < rule.dead_speed
     over = (slow and nearest > rule.fetch) or flat_distance(ball[e], wp.vec3()) > rule.rim
     for agent in range(agents):
-        outcome.terms[e, agent, 0] = rule.progress_weight * progress
-        outcome.terms[e, agent, 1] = wp.where(passed, rule.pass_bonus, 0.0)
-        outcome.terms[e, agent, 2] = -rule.control_cost * mean_square_action(action, e, agent)
-        outcome.metrics[e, agent, 0] = float(play.passes[e])
-        outcome.metrics[e, agent, 1] = float(play.touches[e, agent])
-        outcome.metrics[e, agent, 2] = play.gap[e]
-        outcome.metrics[e, agent, 3] = wp.length(velocity[e])
+        outcome.terms[e, agent, PassBallTask.rewards.progress] = rule.progress_weight * progress
+        outcome.terms[e, agent, PassBallTask.rewards.passed] = wp.where(passed, rule.pass_bonus, 0.0)
+        effort = mean_square_action(action, e, agent)
+        outcome.terms[e, agent, PassBallTask.rewards.control] = -rule.control_cost * effort
+        outcome.metrics[e, agent, PassBallTask.metrics.passes] = float(play.passes[e])
+        outcome.metrics[e, agent, PassBallTask.metrics.touches] = float(play.touches[e, agent])
+        outcome.metrics[e, agent, PassBallTask.metrics.distance] = play.gap[e]
+        outcome.metrics[e, agent, PassBallTask.metrics.ball_speed] = wp.length(velocity[e])
         outcome.success[e, agent] = play.passes[e] >= rule.goal_passes
         if over:
             outcome.terminated[e, agent] = True
@@ -273,14 +274,14 @@ class PassBallTask(Task):
     """Pass the ball to the next agent."""
 
     Config = PassBallConfig
-    description = "avatars on a circle pass a ball of unknown mass to each other, in turn"
+    description = "avatars on a circle pass a soft ball to each other, in turn"
     rewards = (
         Term(
             "progress",
             "`progress_weight` times the metres that the ball has come nearer, horizontally, to its receiver: the "
             "passer until it has touched the ball, then the next agent",
         ),
-        Term("pass", "`pass_bonus` in the step that completes a pass"),
+        Term("passed", "`pass_bonus` in the step that completes a pass"),
         CONTROL,
     )
     metrics = (
@@ -305,8 +306,8 @@ class PassBallTask(Task):
     camera_follows = False
 
     summary = """`num_agents` avatars stand on a circle, `spacing` apart and facing its middle. From there a soft ball
-of 0.4 to 2 kg (`ball_mass`) rolls towards one of them, the first passer. It has to kick or push the ball to the next
-agent, counterclockwise from above, whose turn it then is. A pass is complete when the ball, after the passer has
+of a mass drawn from `ball_mass` rolls towards one of them, the first passer. It has to kick or push the ball to the
+next agent, counterclockwise from above, whose turn it then is. A pass is complete when the ball, after the passer has
 touched it, comes within `reach` of the next one's pelvis or touches that avatar, at least `least_pass` from its place
 at the passer's last touch: the ball must roll, not be carried or held by feet that meet around it. Legs and root act; a
 root goes no farther than `root_range` from its place. All agents get the same reward, except for the cost of their
@@ -343,8 +344,8 @@ actions."""
             ObservationTerm("place", 3, "m", "root", "the agent's place, from the pelvis, horizontally"),
             ObservationTerm("ball_mass", 1, "-", "-", "decimal logarithm of the ball's mass in kg"),
             ObservationTerm("touched", 1, "-", "-", "1 if the passer has touched the ball in this turn"),
-            ObservationTerm("way", 1, "m", "-", "horizontal way of the ball since that touch; 0 before"),
-            ObservationTerm("turn", agents, "-", "-", "1 for the passer, counted on from the observing agent"),
+            ObservationTerm("ball_travel", 1, "m", "-", "horizontal distance of the ball from that touch; 0 before"),
+            ObservationTerm("passer", agents, "-", "-", "1 for the passer, counted on from the observing agent"),
             *FEET_TERMS,
         )
 

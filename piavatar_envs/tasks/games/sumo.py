@@ -89,6 +89,7 @@ def judge(
     e, agent = wp.tid()
     others = others_in(episodes, out, e, agent)
     won = has_won(episodes, out, e, agent, others)
+    lost = out[e, agent] and episodes.failure[e] == 0
     own = from_centre(pelvis[e, agent])
     theirs = float(0.0)
     pushed = wp.vec3()
@@ -101,13 +102,13 @@ def judge(
     lead = float(0.0)
     if others[0] > 0:
         lead = (theirs / float(others[0]) - wp.min(own, ring.ring_radius)) / ring.ring_radius
-    outcome.terms[e, agent, 0] = wp.where(won, ring.win_reward, 0.0)
-    outcome.terms[e, agent, 1] = wp.where(out[e, agent] and episodes.failure[e] == 0, -ring.out_cost, 0.0)
-    outcome.terms[e, agent, 2] = ring.push_weight * lead
-    outcome.terms[e, agent, 3] = -ring.control_cost * mean_square_action(action, e, agent)
-    outcome.metrics[e, agent, 0] = ring.ring_radius - own
-    outcome.metrics[e, agent, 1] = wp.length(wp.vec3(pushed[0], pushed[1], 0.0))
-    outcome.metrics[e, agent, 2] = float(others[1]) + wp.where(out[e, agent], 0.0, 1.0)
+    outcome.terms[e, agent, SumoTask.rewards.win] = wp.where(won, ring.win_reward, 0.0)
+    outcome.terms[e, agent, SumoTask.rewards.out] = wp.where(lost, -ring.out_cost, 0.0)
+    outcome.terms[e, agent, SumoTask.rewards.push] = ring.push_weight * lead
+    outcome.terms[e, agent, SumoTask.rewards.control] = -ring.control_cost * mean_square_action(action, e, agent)
+    outcome.metrics[e, agent, SumoTask.metrics.rim_distance] = ring.ring_radius - own
+    outcome.metrics[e, agent, SumoTask.metrics.push_impulse] = wp.length(wp.vec3(pushed[0], pushed[1], 0.0))
+    outcome.metrics[e, agent, SumoTask.metrics.standing] = float(others[1]) + wp.where(out[e, agent], 0.0, 1.0)
     outcome.success[e, agent] = won
     outcome.terminated[e, agent] = won or out[e, agent]
 
