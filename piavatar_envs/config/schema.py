@@ -171,7 +171,12 @@ class PoseControlConfig(BaseModel):
         description="increment (the tracked pose moves by the command's change), target (the tracked pose moves to "
         "the commanded one) or reference (open loop); target and reference only for undisturbed reproduction",
     )
-    tone: float = Field(1.0, ge=0.0, le=1.0, description="resistance of the pose to contact: 0 limp, 1 tensed [-]")
+    tone: float = Field(
+        1.0,
+        ge=0.0,
+        le=1.0,
+        description="how firmly joints return to the commanded pose after contact: 0 limp, 1 tensed [-]",
+    )
     alpha: float = Field(0.3, ge=0.0, le=1.0, description="shape preservation, as a share of a control step [-]")
     shape_preservation: Literal["physical", "kinematic"] = Field(
         "physical",

@@ -138,15 +138,15 @@ class HeaderTask(GateTask):
     camera_position = (-4.7, 0.1, 2.0)
     camera_target = (0.0, -0.85, 1.05)
 
-    summary = """A soft ball of 0.2 to 0.6 kg falls from a height in the range `ball_height`, with a speed of up to
-`ball_speed` to the side, and comes down within about `ball_jitter` of `ball_place`: on the forehead of an avatar that
-stands upright, its joints slightly bent at random (`pose_noise`), its root held in place. A gate hangs in front, at a
-`target_distance` from the ball's start and up to `target_angle` to either side. Left alone, the ball drops off the
-head. A good agent leans back and to the side, lets trunk and neck snap forward when the ball arrives, and meets it off
-its centre to steer it.
+    summary = """A soft ball, its mass drawn from `ball_mass`, falls from a height in the range `ball_height`, with a
+speed of up to `ball_speed` to the side, and comes down within about `ball_jitter` of `ball_place`: on the forehead of
+an avatar that stands upright, its joints slightly bent at random (`pose_noise`), its root held in place. A gate hangs
+in front, at a `target_distance` from the ball's start and up to `target_angle` to either side. Left alone, the ball
+drops off the head. A good agent leans back and to the side, lets trunk and neck snap forward when the ball arrives, and
+meets it off its centre to steer it.
 
-The shaping terms pay only for improvements on the best of the episode, so all terms but the control cost add up to
-at most 1, half of it for the goal."""
+The shaping terms pay only for improvements on the best of the episode, so all terms but the control cost add up to at
+most 1, half of it for the goal."""
     picture_seconds = 0.43
     picture_actions: ClassVar[Mapping[str, float]] = {"spine2.x": -0.05, "neck.x": -0.1, "head.x": -0.1}
 

@@ -85,7 +85,7 @@ class KickBallTask(GateTask):
     """Kick the ball through the gate."""
 
     Config = KickBallConfig
-    description = "kick a ball of 0.2 to 8 kg through a gate on the ground"
+    description = "kick a soft ball through a gate on the ground"
     observation_terms = (*GATE_TERMS, *FEET_TERMS)
 
     camera_position = (-3.6, 0.9, 1.5)
