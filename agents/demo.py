@@ -106,6 +106,12 @@ def run(options: Options, console: Console) -> Outcome:
         untrained = ppo.build(config.ppo, venv, seen, config.seed)
         before = policy_agent(copy.deepcopy(untrained.policy))
         model, curve = train(config, venv, facts, options.out, deadline=deadline)
+        if model.num_timesteps < config.total_steps:
+            console.print(
+                f"training ended after {model.num_timesteps} of {config.total_steps} steps, because the demo may take "
+                f"{options.seconds:g} s on this machine; python -m agents.demo --seconds {3.0 * options.seconds:g} "
+                "gives it more"
+            )
         trained, _ = _timed_play("trained", policy_agent(model), config, venv)
     finally:
         venv.close()
