@@ -121,6 +121,7 @@ def build_matter(
     poisson_ratio: float = 0.3,
     density: float = 1000.0,
     material: str = "neo_hookean",
+    retardation: float = 0.0,
     gravity: Sequence[float] = (0.0, 0.0, 0.0),
     pushed: bool = False,
     planes: Sequence[tuple[Sequence[float], float, float]] = (),
@@ -143,6 +144,7 @@ def build_matter(
         poisson_ratio: likewise.
         density: likewise [kg/m^3].
         material: likewise.
+        retardation: viscosity over modulus, likewise [s].
         gravity: [m/s^2].
         pushed: whether :meth:`Matter.push` has an effect.
         planes: normal, offset [m] and friction [-] of each.
@@ -153,7 +155,7 @@ def build_matter(
         rest = lattice(lower, upper, spacing)
     if points is None:
         volume = np.full(len(rest), spacing**3)
-        points = MaterialPoints.uniform(volume, density, young_modulus, poisson_ratio, material)
+        points = MaterialPoints.uniform(volume, density, young_modulus, poisson_ratio, material, retardation)
     grid = make_grid(np.subtract(lower, margin), np.add(upper, margin), dx)
     colliders = [Collider.plane(*plane) for plane in planes]
     model = build_model(points, grid, device=device, gravity=gravity, colliders=colliders, **kwargs)

@@ -91,6 +91,8 @@ def _check_flesh_rate(rates: tuple[float, float]) -> tuple[float, float]:
 MOST_SUBSTEPS = 10_000
 #: Greatest Young's modulus [Pa] and range of densities [kg/m^3] of soft matter: hard plastic, thin smoke, osmium.
 MOST_MODULUS = 1.0e9
+#: Greatest viscosity [Pa s] and damping ratio of soft matter.
+MOST_VISCOSITY, MOST_DAMPING = 1.0e6, 10.0
 LEAST_DENSITY, MOST_DENSITY = 0.1, 25_000.0
 #: Greatest distance from the origin along each axis [m].
 FARTHEST = 1000.0
@@ -150,6 +152,16 @@ class PhysicsConfig(BaseModel):
     )
     poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio of the flesh [-]")
     density: float = Field(1000.0, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density of the flesh [kg/m^3]")
+    viscosity: float = Field(
+        0.0, ge=0.0, le=MOST_VISCOSITY, description="shear viscosity of the flesh, beside that of damping_ratio [Pa s]"
+    )
+    damping_ratio: float = Field(
+        0.0,
+        ge=0.0,
+        le=MOST_DAMPING,
+        description="damping of the flesh over critical damping, for vibrations at 25 Hz; in proportion to frequency "
+        "at others [-]",
+    )
     decoupling: Literal["split", "paper", "none", "no_stress"] = Field(
         "split",
         description="how commanded motion is kept out of the strain: split (two velocities, the default), paper (its "
@@ -317,7 +329,15 @@ class RandomizeConfig(BaseModel):
 
 
 #: Settings of ``physics`` in which avatars may differ.
-OF_FLESH = ("material", "young_modulus", "soft_young_modulus", "poisson_ratio", "density")
+OF_FLESH = (
+    "material",
+    "young_modulus",
+    "soft_young_modulus",
+    "poisson_ratio",
+    "density",
+    "viscosity",
+    "damping_ratio",
+)
 
 
 def _of_flesh(settings: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -403,6 +423,12 @@ class RegionConfig(BaseModel):
     density: float | None = Field(
         None, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density; null as the rest [kg/m^3]"
     )
+    viscosity: float | None = Field(
+        None, ge=0.0, le=MOST_VISCOSITY, description="shear viscosity; null as the rest [Pa s]"
+    )
+    damping_ratio: float | None = Field(
+        None, ge=0.0, le=MOST_DAMPING, description="damping ratio at 25 Hz; null as the rest [-]"
+    )
 
 
 class AvatarConfig(BaseModel):
@@ -414,7 +440,8 @@ class AvatarConfig(BaseModel):
     yaw: float = Field(0.0, ge=-10.0, le=10.0, description="initial turn about the vertical; at 0 it faces -y [rad]")
     physics: Annotated[dict[str, Any], AfterValidator(_of_flesh), _settings_of(PhysicsConfig)] = Field(
         default_factory=dict,
-        description="material, young_modulus, soft_young_modulus, poisson_ratio or density of its flesh",
+        description="material, young_modulus, soft_young_modulus, poisson_ratio, density, viscosity or damping_ratio "
+        "of its flesh",
     )
     control: Annotated[dict[str, Any], AfterValidator(_of_control)] = Field(
         default_factory=dict, description="settings of its control, such as tone; all avatars have the same mode"
@@ -451,6 +478,15 @@ class PropConfig(BaseModel):
         description="Young's modulus; null for waves as fast as the flesh's, which needs no more substeps [Pa]",
     )
     poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio [-]")
+    viscosity: float = Field(
+        0.0, ge=0.0, le=MOST_VISCOSITY, description="shear viscosity, beside that of damping_ratio [Pa s]"
+    )
+    damping_ratio: float = Field(
+        0.0,
+        ge=0.0,
+        le=MOST_DAMPING,
+        description="damping over critical damping, for vibrations at 25 Hz; in proportion to frequency at others [-]",
+    )
     position: Vector = Field((0.0, -1.0, 1.0), description="initial position of its centre of mass [m]")
     rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="initial rotation, quaternion wxyz")
     velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="initial velocity [m/s]")

@@ -129,6 +129,7 @@ class MaterialPoints:
         young_modulus: Young's modulus [Pa].
         poisson_ratio: Poisson's ratio.
         material: index of the constitutive model, see :func:`piavatar_envs.mpm.materials.material_index`.
+        retardation: viscosity over modulus [s]; zero for all if not given.
         field: velocity field, shape ``(num_particles,)`` int; the first for all if not given.
         seam: 1 where fields of a subject merge, shape ``(num_particles,)``; nowhere if not given.
         sensor: row of the contact sensor, -1 for none, shape ``(num_particles,)`` int; none if not given.
@@ -139,6 +140,7 @@ class MaterialPoints:
     young_modulus: np.ndarray
     poisson_ratio: np.ndarray
     material: np.ndarray
+    retardation: np.ndarray | None = None
     field: np.ndarray | None = None
     seam: np.ndarray | None = None
     sensor: np.ndarray | None = None
@@ -151,17 +153,23 @@ class MaterialPoints:
         young_modulus: float = 1.0e5,
         poisson_ratio: float = 0.3,
         material: str = "neo_hookean",
+        retardation: float = 0.0,
     ) -> MaterialPoints:
         """Return points of one material; ``volume`` [m^3] has shape ``([1 or num_envs,] num_particles)``."""
         volume = np.atleast_2d(np.asarray(volume, np.float32))
         one = np.ones((1, volume.shape[1]), np.float32)
         index = np.full(one.shape, material_index(material), np.int32)
-        return cls(volume, density * one, young_modulus * one, poisson_ratio * one, index)
+        return cls(volume, density * one, young_modulus * one, poisson_ratio * one, index, retardation * one)
 
     @property
     def fields(self) -> np.ndarray:
         """Velocity field of every particle, shape ``(num_particles,)`` int."""
         return np.zeros(self.num_particles, int) if self.field is None else self.field
+
+    @property
+    def retardations(self) -> np.ndarray:
+        """Viscosity over modulus of every particle [s], shape ``(1 or num_envs, num_particles)``."""
+        return np.zeros((1, self.num_particles)) if self.retardation is None else self.retardation
 
     @property
     def num_particles(self) -> int:
@@ -170,8 +178,28 @@ class MaterialPoints:
 
     def sound_speed(self) -> float:
         """Return the speed of the fastest elastic wave, ``sqrt((lam + 2 mu) / rho)`` [m/s]."""
+        return float(self._sound_speeds().max())
+
+    def limiting_speed(self, dx: float, factor: float = 1.0) -> float:
+        """Return the speed of the elastic wave whose limit of the time step is that of viscous matter [m/s].
+
+        It is 0 without viscosity, where :meth:`sound_speed` alone limits the time step.
+
+        Viscosity shortens the limit ``2 / w`` of a mode of frequency ``w`` and damping ratio ``z = w retardation / 2``
+        to ``(2 / w) (sqrt(1 + z^2) - z)`` (Belytschko, Liu & Moran, "Nonlinear Finite Elements for Continua and
+        Structures", 2000, chapter 6). The fastest mode of the grid is the one that ``CFL_STABLE`` keeps stable.
+
+        Args:
+            dx: grid spacing [m].
+            factor: on the speeds of elastic waves.
+        """
+        speed = factor * self._sound_speeds()
+        ratio = self.retardations * speed / (CFL_STABLE * dx)
+        return float(np.where(ratio > 0.0, speed * (np.sqrt(1.0 + ratio**2) + ratio), 0.0).max())
+
+    def _sound_speeds(self) -> np.ndarray:
         mu, lam = lame_parameters(self.young_modulus, self.poisson_ratio)
-        return float(np.sqrt((lam + 2.0 * mu) / self.density).max())
+        return np.sqrt((lam + 2.0 * mu) / self.density)
 
 
 def choose_num_substeps(control_dt: float, dx: float, sound_speed: float, cfl: float = 0.5) -> int:
@@ -179,11 +207,21 @@ def choose_num_substeps(control_dt: float, dx: float, sound_speed: float, cfl: f
     return max(1, math.ceil(control_dt * sound_speed / (cfl * dx) - 1.0e-9))
 
 
-def check_num_substeps(num_substeps: int, control_dt: float, dx: float, sound_speed: float) -> None:
+def check_num_substeps(
+    num_substeps: int, control_dt: float, dx: float, sound_speed: float, limiting_speed: float = 0.0
+) -> None:
     """Check the stability of the time step.
 
+    Args:
+        num_substeps: substeps of a control step.
+        control_dt: control step [s].
+        dx: grid spacing [m].
+        sound_speed: fastest elastic wave [m/s].
+        limiting_speed: that of :meth:`MaterialPoints.limiting_speed`; 0 for matter without viscosity [m/s].
+
     Raises:
-        ValueError: there is no substep, or ``sound_speed * dt / dx`` exceeds the largest stable value.
+        ValueError: there is no substep, or ``sound_speed * dt / dx``, or the same with the limiting speed, exceeds the
+            largest stable value.
     """
     if num_substeps < 1:
         raise ValueError(f"num_substeps={num_substeps} must be at least 1")
@@ -193,6 +231,12 @@ def check_num_substeps(num_substeps: int, control_dt: float, dx: float, sound_sp
         raise ValueError(
             f"sim_dt={dt:.3g} s exceeds the CFL limit {limit:.3g} s (dx={dx:.3g} m, c={sound_speed:.3g} m/s); "
             f"use num_substeps >= {choose_num_substeps(control_dt, dx, sound_speed, CFL_STABLE)}"
+        )
+    if dt * limiting_speed > CFL_STABLE * dx:
+        limit = CFL_STABLE * dx / limiting_speed
+        raise ValueError(
+            f"sim_dt={dt:.3g} s exceeds the limit {limit:.3g} s of matter of this viscosity (dx={dx:.3g} m); use "
+            f"num_substeps >= {choose_num_substeps(control_dt, dx, limiting_speed, CFL_STABLE)}, or less viscosity"
         )
 
 
@@ -226,7 +270,7 @@ def check_points(points: MaterialPoints, num_envs: int, fields: Fields) -> None:
     """
     if points.field is not None and not (points.field.min() >= 0 and points.field.max() < fields.num_fields):
         raise ValueError(f"field={points.field.max()} of a particle: there are {fields.num_fields} velocity fields")
-    for name in ("volume", "density", "young_modulus", "poisson_ratio", "material"):
+    for name in ("volume", "density", "young_modulus", "poisson_ratio", "material", "retardations"):
         array = getattr(points, name)
         if len(array) not in (1, num_envs):
             raise ValueError(f"{name} has {len(array)} rows; give it 1 or {num_envs}, one an environment")
@@ -234,6 +278,9 @@ def check_points(points: MaterialPoints, num_envs: int, fields: Fields) -> None:
         bad = array[~(array > 0.0)]
         if bad.size:
             raise ValueError(f"{name}={bad[0]:g} must be positive: a particle without mass cannot move")
+    bad = points.retardations[~(points.retardations >= 0.0)]
+    if bad.size:
+        raise ValueError(f"retardation={bad[0]:g} s must not be negative: viscosity cannot add energy")
 
 
 def build_model(
@@ -250,6 +297,7 @@ def build_model(
     colliders: Sequence[Collider] = (),
     fields: Fields | None = None,
     sound_speed: float | None = None,
+    limiting_speed: float | None = None,
     max_active_blocks: int | None = None,
     rest: np.ndarray | None = None,
     path: str | None = None,
@@ -269,6 +317,7 @@ def build_model(
         num_substeps: substeps of a control step; from the CFL limit if not given.
         cfl: Courant number ``c dt / dx`` of that choice.
         sound_speed: elastic wave speed to design for [m/s], where parameters will be randomised.
+        limiting_speed: speed of :meth:`MaterialPoints.limiting_speed` to design for, likewise [m/s].
         max_active_blocks: most active blocks of an environment, over all fields; enough for any state if not given.
         rest: positions at rest [m], shape ``(P, 3)``, from which tiles of large bodies are made compact.
         path: one of ``PATHS``; if not given, ``"block"`` on a GPU whose shared memory holds an environment's grid, else
@@ -282,9 +331,12 @@ def build_model(
     fields = fields or Fields()
     check_points(points, num_envs, fields)
     sound_speed = max(points.sound_speed(), sound_speed or 0.0)
+    limiting_speed = max(points.limiting_speed(grid.dx), limiting_speed or 0.0)
     if num_substeps is None:
-        num_substeps = choose_num_substeps(control_dt, grid.dx, sound_speed, cfl)
-    check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
+        num_substeps = choose_num_substeps(
+            control_dt, grid.dx, max(sound_speed, cfl / CFL_STABLE * limiting_speed), cfl
+        )
+    check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed, limiting_speed)
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
     max_active_blocks = bound_active_blocks(max_active_blocks, points.fields, grid, fields.num_fields)
     path = choose_path(path, device, points.fields, max_active_blocks, decoupling)
@@ -351,6 +403,7 @@ def upload_points(
 
     particles.mass = upload(points.volume * points.density, float)
     particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
+    particles.retardation = upload(points.retardations, float)
     particles.material = upload(points.material, int)
     particles.field = upload(points.fields, int)
     particles.tiles = wp.array(plan_tiles(points.fields, rest, dx), dtype=wp.vec2i, device=device)

@@ -84,6 +84,7 @@ class Particles:
     volume: wp.array2d(dtype=float)  # rest volume [m^3]
     mu: wp.array2d(dtype=float)  # shear modulus [Pa]
     lam: wp.array2d(dtype=float)  # first Lame parameter [Pa]
+    retardation: wp.array2d(dtype=float)  # viscosity over modulus, of shear and of volume alike [s]
     material: wp.array2d(dtype=int)  # index into piavatar_envs.mpm.materials.MATERIALS
     field: wp.array(dtype=int)  # (num_particles,) velocity field
     seam: wp.array(dtype=float)  # (num_particles,) 1 where two fields of a subject merge, else 0

@@ -31,7 +31,7 @@ from piavatar_envs.config import (
     ShapeConfig,
 )
 from piavatar_envs.config import replace as changed
-from piavatar_envs.mpm.materials import material_index
+from piavatar_envs.mpm.materials import lame_parameters, material_index, retardation_time
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Model
 
@@ -209,10 +209,16 @@ class Flesh:
         if physics.soft_young_modulus is not None:
             # interpolated geometrically, because stiffness varies over decades
             young = young * (physics.soft_young_modulus / physics.young_modulus) ** self._softness(self.points.rest[0])
+        young = self._region_values("young_modulus", young.astype(np.float32))
+        poisson = self._region_values("poisson_ratio", matter.poisson_ratio[0])
+        viscosity = self._region_values("viscosity", np.full(len(young), physics.viscosity))
+        damping = self._region_values("damping_ratio", np.full(len(young), physics.damping_ratio))
+        mu, _ = lame_parameters(young, poisson)
         return replace(
             matter,
-            young_modulus=self._region_values("young_modulus", young.astype(np.float32))[None],
-            poisson_ratio=self._region_values("poisson_ratio", matter.poisson_ratio[0])[None],
+            young_modulus=young[None],
+            poisson_ratio=poisson[None],
+            retardation=retardation_time(viscosity, damping, mu)[None],
             density=self._region_values("density", matter.density[0])[None],
             material=self._region_values("material", matter.material[0])[None],
         )

@@ -14,7 +14,7 @@ from piavatar_envs.config import ColliderConfig, ConfigError, PhysicsConfig, Pro
 from piavatar_envs.config.schema import LEAST_DENSITY, MOST_DENSITY
 from piavatar_envs.core.arrays import store_matrix
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.mpm.materials import lame_parameters
+from piavatar_envs.mpm.materials import lame_parameters, retardation_time
 from piavatar_envs.mpm.measured_strain import make_neighbours, record_correction
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Kinematic, Model, Particles, State, row
@@ -66,7 +66,9 @@ def prop_matter(prop: PropConfig, points: PropPoints, physics: PhysicsConfig) ->
         # equal P-wave modulus over density
         young = physics.young_modulus * density / physics.density
         young *= _wave_factor(physics.poisson_ratio) / _wave_factor(prop.poisson_ratio)
-    return MaterialPoints.uniform(points.volume, density, young, prop.poisson_ratio, prop.material)
+    mu, _ = lame_parameters(young, prop.poisson_ratio)
+    retardation = float(retardation_time(prop.viscosity, prop.damping_ratio, mu))
+    return MaterialPoints.uniform(points.volume, density, young, prop.poisson_ratio, prop.material, retardation)
 
 
 def _wave_factor(poisson_ratio: float) -> float:
@@ -370,8 +372,8 @@ def scale_density(
 ):
     """Set the density ``(num_envs,)`` [kg/m^3] of a prop in the masked environments; over ``(num_envs, count)``.
 
-    Moduli scale with density, which keeps the wave speed ``sqrt((lam + 2 mu) / rho)`` and thus the largest stable time
-    step. ``mass``, ``mu`` and ``lam`` need a row for every environment.
+    Moduli and viscosity scale with density, which keeps the wave speed ``sqrt((lam + 2 mu) / rho)``, damping ratios and
+    thus the largest stable time step. ``mass``, ``mu`` and ``lam`` need a row for every environment.
     """
     e, p = wp.tid()
     if not mask[e]:

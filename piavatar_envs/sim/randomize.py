@@ -7,7 +7,7 @@ depend on it, each from its nominal value, so that none of them drifts:
 - *mass*: an avatar's density, and with it the mass of its particles and bones, the limits of the root wrench (which are
   in body weights), strength and springs of its joints under torque control (a heavier body is a stronger one), and the
   reference density of its velocity fields;
-- *stiffness*: the moduli of its flesh;
+- *stiffness*: the moduli of its flesh, and with them its viscosity;
 - *ground friction*: coefficients on the ground, walls and colliders; *body friction*: those between bodies.
 
 Only constants that vary get a row for each environment. The time step is that of the stiffest and lightest body that
@@ -72,8 +72,17 @@ OF_AVATAR = {"mass_factor": "density", "stiffness_factor": "Young's modulus"}
 
 def fastest_wave(config: RandomizeConfig, flesh: Iterable[MaterialPoints]) -> float:
     """Return the speed of the fastest elastic wave [m/s] in ``flesh`` that ``config`` can draw."""
-    fastest = max(matter.sound_speed() for matter in flesh)
-    return fastest * math.sqrt(config.stiffness_factor[1] / config.mass_factor[0])
+    return _greatest_factor(config) * max(matter.sound_speed() for matter in flesh)
+
+
+def limiting_wave(config: RandomizeConfig, flesh: Iterable[MaterialPoints], dx: float) -> float:
+    """Return the greatest :meth:`.MaterialPoints.limiting_speed` of ``flesh`` that ``config`` can draw [m/s]."""
+    return max(matter.limiting_speed(dx, _greatest_factor(config)) for matter in flesh)
+
+
+def _greatest_factor(config: RandomizeConfig) -> float:
+    """Return the greatest factor on the speeds of elastic waves in the flesh."""
+    return math.sqrt(config.stiffness_factor[1] / config.mass_factor[0])
 
 
 @dataclass

@@ -242,5 +242,5 @@ def _join(parts: Sequence[MaterialPoints], rows: int) -> MaterialPoints:
         arrays = [getattr(part, name) for part in parts]
         return np.concatenate([np.broadcast_to(a, (max(rows, len(a)), a.shape[1])) for a in arrays], axis=1)
 
-    names = ("volume", "density", "young_modulus", "poisson_ratio", "material")
+    names = ("volume", "density", "young_modulus", "poisson_ratio", "material", "retardation")
     return MaterialPoints(**{name: side_by_side(name) for name in names})

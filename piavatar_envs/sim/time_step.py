@@ -55,7 +55,7 @@ def choose_substeps(
         solids: particles of the props.
         impulses: the greatest impulse on each bone [N s], by joint.
         dx: grid spacing [m].
-        wave: speed of the fastest elastic wave [m/s].
+        wave: speed of the fastest elastic wave, or more where viscosity limits the time step [m/s].
 
     Raises:
         ConfigError: the configured substeps are too long for torque control or for something fast, or more substeps
@@ -95,8 +95,8 @@ def _fewest(physics: PhysicsConfig, dx: float, wave: float, speed: float) -> int
     if chosen > MOST_SUBSTEPS:
         raise ConfigError(
             f"waves of {wave:.3g} m/s and parts of up to {speed:.3g} m/s would need {chosen} substeps a control step, "
-            f"and {MOST_SUBSTEPS} is the limit; use a shorter physics.control_dt, softer or denser matter "
-            "(young_modulus, density, randomize), or slower parts"
+            f"and {MOST_SUBSTEPS} is the limit; use a shorter physics.control_dt, softer, denser or less viscous "
+            "matter (young_modulus, density, viscosity, randomize), or slower parts"
         )
     return chosen
 

@@ -22,14 +22,14 @@ from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.contact_sensors import clear_masked_sensors
 from piavatar_envs.mpm.memory import allocate, estimate_active_blocks
-from piavatar_envs.mpm.model import build_model, make_grid
+from piavatar_envs.mpm.model import CFL_STABLE, build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
 from piavatar_envs.sim.bodies import Flesh, load_avatar, pose_control
 from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_places
 from piavatar_envs.sim.forces import Forces, Receivers
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
-from piavatar_envs.sim.randomize import Randomization, fastest_wave
+from piavatar_envs.sim.randomize import Randomization, fastest_wave, limiting_wave
 from piavatar_envs.sim.scene import Domain, assemble
 from piavatar_envs.sim.shapes import Shapes, check_shape_names
 from piavatar_envs.sim.time_step import choose_substeps
@@ -166,8 +166,10 @@ class Simulation:
         rest = np.concatenate(
             [*(flesh.points.rest[0] for flesh in self.flesh), *(points.rest for points in self._solids)]
         )
-        wave = fastest_wave(config.randomize, [flesh.matter() for flesh in self.flesh])
-        fastest = max(wave, subjects.matter.sound_speed())
+        matter = [flesh.matter() for flesh in self.flesh]
+        wave, limiting = fastest_wave(config.randomize, matter), limiting_wave(config.randomize, matter, self.dx)
+        viscous = physics.cfl / CFL_STABLE * max(limiting, subjects.matter.limiting_speed(self.dx))
+        fastest = max(wave, subjects.matter.sound_speed(), viscous)
         self.model = build_model(
             subjects.matter,
             make_grid(self.domain.lower, self.domain.upper, self.dx),
@@ -185,6 +187,7 @@ class Simulation:
             max_active_blocks=estimate_active_blocks(rest, subjects.matter.field, self.dx),
             rest=rest,
             sound_speed=wave,
+            limiting_speed=limiting,
         )
         fields = self.model.contact.num_fields
         self.initial_colliders = make_boundaries(subjects.colliders, fields, self.num_envs, self.device)

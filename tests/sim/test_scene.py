@@ -7,16 +7,17 @@ import pytest
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.mpm.materials import material_index
+from piavatar_envs.mpm.materials import DAMPING_FREQUENCY, material_index
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.sim.world import Simulation
 
 BALL = {"name": "ball", "mass": 0.5, "position": [0.0, -1.0, 1.0]}
 
 
-def world(device, num_envs=1, **scene) -> Simulation:
+def world(device, num_envs=1, settings=None, **scene) -> Simulation:
     """Return a world of tiny bodies."""
-    return Simulation(load_config(EnvConfig, None, {"fidelity": "tiny", "scene": scene}), num_envs, device)
+    overrides = {"fidelity": "tiny", "scene": scene, **(settings or {})}
+    return Simulation(load_config(EnvConfig, None, overrides), num_envs, device)
 
 
 def test_as_many_avatars_as_the_scene_says(device):
@@ -81,6 +82,27 @@ def test_regions_are_of_another_material(device):
     assert (particles.material.numpy()[0] == material).all()
     density = particles.mass.numpy()[0] / particles.volume.numpy()[0]
     assert density[ankle] == pytest.approx(1200.0, rel=1e-4) and density[~ankle] == pytest.approx(1000.0, rel=1e-4)
+
+
+def test_matter_has_viscosity_of_its_own(device):
+    # As a viscosity or as a damping ratio, of the flesh, of a region of it, and of a prop, which has none unless given.
+    avatars = [{"physics": {"damping_ratio": 0.1}, "regions": [{"joints": ["head"], "viscosity": 50.0}]}]
+    props = [{**BALL, "viscosity": 20.0}, {**BALL, "name": "other", "position": (0.5, -1.0, 1.0)}]
+    simulation = world(device, avatars=avatars, props=props)
+    first, particles = simulation.subjects.first, simulation.model.particles
+    viscosity = particles.retardation.numpy()[0] * particles.mu.numpy()[0]
+    owner = np.array([JOINT_NAMES[j] for j in simulation.flesh[0].sampled.skin_joints[:, 0]])
+    of_ratio = 0.1 / (np.pi * DAMPING_FREQUENCY) * 1.0e5 / 2.6
+    assert viscosity[: first[1]] == pytest.approx(np.where(owner == "head", of_ratio + 50.0, of_ratio), rel=1e-5)
+    assert viscosity[first[1] : first[2]] == pytest.approx(20.0, rel=1e-5)
+    assert (viscosity[first[2] :] == 0.0).all()
+
+
+def test_viscous_matter_sets_the_time_step(device):
+    # Of the most viscous flesh that can be drawn: stiffness scales viscosity.
+    plain, viscous = (world(device, settings={"damping_ratio": ratio}) for ratio in (0.0, 0.5))
+    drawn = world(device, settings={"damping_ratio": 0.5, "randomize": {"stiffness_factor": (1.0, 1.5)}})
+    assert plain.model.num_substeps < viscous.model.num_substeps < drawn.model.num_substeps
 
 
 def test_props_begin_inside_the_domain(device):

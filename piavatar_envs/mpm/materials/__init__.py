@@ -33,6 +33,10 @@ class Material:
     energy: Callable[[np.ndarray, float, float], np.ndarray]
 
 
+#: Frequency for which damping ratios are stated [Hz], the lowest at which Klatt et al., "Viscoelasticity-based MR
+#: elastography of skeletal muscle", 2010, measured relaxed muscle. A vibration of another frequency is damped in
+#: proportion to it.
+DAMPING_FREQUENCY = 25.0
 #: The usual material, which the dispatch evaluates last.
 DEFAULT = "neo_hookean"
 
@@ -162,6 +166,31 @@ def lame_parameters(young_modulus, poisson_ratio):
     mu = young_modulus / (2.0 * (1.0 + poisson_ratio))
     lam = young_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
     return mu, lam
+
+
+def retardation_time(
+    viscosity: float | np.ndarray, damping_ratio: float | np.ndarray, mu: float | np.ndarray
+) -> np.ndarray:
+    """Return the retardation time of a Kelvin-Voigt solid [s], the sum of what two settings give it.
+
+    Args:
+        viscosity: of shear [Pa s].
+        damping_ratio: damping over critical damping of a vibration at :data:`DAMPING_FREQUENCY`.
+        mu: shear modulus [Pa].
+    """
+    return np.asarray(viscosity / mu + damping_ratio / (np.pi * DAMPING_FREQUENCY))
+
+
+@wp.func
+def viscous_stress(C: wp.mat33, J: float, mu: float, lam: float, retardation: float):
+    """Return the viscous Kirchhoff stress of a Kelvin-Voigt solid [Pa].
+
+    It is ``J t (2 mu D + lam tr(D) I)`` with the rate of strain ``D``, the symmetric part of the velocity gradient
+    ``C``, and the retardation time ``t`` [s] (Landau & Lifshitz, "Theory of Elasticity", 1986, section 34). A rotation
+    has no rate of strain, so it is not damped.
+    """
+    D = 0.5 * (C + wp.transpose(C))
+    return (J * retardation) * (2.0 * mu * D + wp.diag(wp.vec3(lam * wp.trace(D))))
 
 
 @wp.func
