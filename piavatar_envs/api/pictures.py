@@ -342,6 +342,7 @@ class MouseForce:
         self._batch, self._env, self._push = batch, env, push
         self._drag: Drag | None = None
         self._grip: Grip | None = None
+        self._before: np.ndarray | None = None  # the grabbed point before the last control step [m]
 
     def apply(self, drag: Drag | None) -> None:
         """Let the force of a drag act in the next control step; none without a drag."""
@@ -350,14 +351,19 @@ class MouseForce:
             return
         if self._grip is None or drag.start is not self._drag.start:
             self._grip = grip_at(self._batch, self._env, drag)
-            self._before = self._grip.point(self._env)
+            self.settle()
         self._drag, grip = drag, self._grip
         point = grip.point(self._env)
-        velocity = (point - self._before) / self._batch.config.physics.control_dt
+        before = point if self._before is None else self._before
+        velocity = (point - before) / self._batch.config.physics.control_dt
         self._before = point
         force = grip.mass * DRAG_RATE**2 * (drag.end - point) - 2.0 * grip.own_mass * DRAG_RATE * velocity
         force *= min(1.0, MOST_DRAG * grip.mass / max(float(np.linalg.norm(force)), 1e-9))
         self._push(grip.name, force, point, agent=grip.agent, envs=self._env)
+
+    def settle(self) -> None:
+        """Take what is grabbed to be at rest, because it was placed."""
+        self._before = None
 
     def arrow(self) -> Arrow | None:
         """Return an arrow from the grabbed point to the mouse, if something is dragged."""
@@ -431,6 +437,7 @@ class Live:
 
     def begin(self) -> None:
         """Show the scene after a reset, and begin a control step now."""
+        self._mouse.settle()
         self.show()
         self.pace.begin()
 
