@@ -11,7 +11,7 @@ import numpy as np
 
 from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed
 from piavatar_envs.api.pictures import RENDER_MODES, check_render_mode
-from piavatar_envs.config import load_config
+from piavatar_envs.config import load_keywords
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_registered
 
@@ -56,12 +56,12 @@ class AvatarEnv(SingleView, gym.Env):
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
-            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
             ImportError: ``render_mode="human"`` without the extra ``live``.
             ValueError: an unknown task or one that the id is not registered for, an unknown render mode or device.
         """
         task_class = load_registered(task, registered)
-        settings = load_config(task_class.Config, config, overrides)
+        settings = load_keywords(task_class.Config, config, overrides)
         made = {"task": task_class, "render_mode": render_mode, "device": device, "config": settings}
         self._build = partial(AvatarEnv.__init__, **made)
         self.config, self.render_mode, self._over = settings, check_render_mode(render_mode), False

@@ -11,7 +11,7 @@ import numpy as np
 
 from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed
 from piavatar_envs.api.pictures import RENDER_MODES, check_render_mode
-from piavatar_envs.config import load_config, replace
+from piavatar_envs.config import load_keywords, replace
 from piavatar_envs.envs.batch_env import check_count
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
@@ -66,12 +66,12 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
-            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
             ImportError: ``render_mode="human"`` without the extra ``live``.
             ValueError: an unknown task, render mode or device, or less than one control step.
         """
         task_class = load_task(task)
-        self.config = load_config(task_class.Config, config, overrides)
+        self.config = load_keywords(task_class.Config, config, overrides)
         if max_cycles is not None:
             check_count("max_cycles", max_cycles, ", or None for episode_seconds")
             self.config = replace(self.config, episode_seconds=max_cycles * self.config.physics.control_dt)

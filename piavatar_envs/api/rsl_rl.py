@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from piavatar_envs.api.host import EpisodeHost, HostView, Settings
-from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.config import ConfigError, EnvConfig, load_keywords
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
 
@@ -69,11 +69,12 @@ class AvatarRslEnv(HostView, VecEnv):
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
-            ConfigError: a setting that is unknown, of the wrong type or out of range, or an unknown term in a group.
+            ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range, or an unknown
+                term in a group.
             ValueError: an unknown task or device, no environments, or a seed outside [0, 2^32).
         """
         task_class = load_task(task)
-        self.config = load_config(task_class.Config, config, overrides)
+        self.config = load_keywords(task_class.Config, config, overrides)
         # a copy is built by _make, which begins no episodes
         made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarRslEnv._make, task=task_class, **made)

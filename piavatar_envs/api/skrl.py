@@ -22,7 +22,7 @@ import gymnasium as gym
 
 from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.host import EpisodeHost, HostView, Settings, Transition
-from piavatar_envs.config import load_config
+from piavatar_envs.config import load_keywords
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
 
@@ -63,12 +63,12 @@ class AvatarSkrlEnv(HostView):
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
-            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
             ImportError: torch is not installed.
             ValueError: an unknown task or device, or no environments.
         """
         task_class = load_task(task)
-        self.config = load_config(task_class.Config, config, overrides)
+        self.config = load_keywords(task_class.Config, config, overrides)
         made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarSkrlEnv.__init__, task=task_class, **made)
         self.host = EpisodeHost(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
@@ -179,12 +179,12 @@ class AvatarSkrlMultiEnv(HostView):
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
-            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
             ImportError: torch is not installed.
             ValueError: an unknown task or device, or no environments.
         """
         task_class = load_task(task)
-        self.config = load_config(task_class.Config, config, overrides)
+        self.config = load_keywords(task_class.Config, config, overrides)
         made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarSkrlMultiEnv.__init__, task=task_class, **made)
         self.host = EpisodeHost(task_class(self.config), num_envs, device, "torch", num_threads)

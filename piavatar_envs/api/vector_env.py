@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.host import EpisodeHost, HostView, Settings, failure_names
 from piavatar_envs.api.pictures import BATCH_RENDER_MODES, check_batch_render_mode
-from piavatar_envs.config import EnvConfig, load_config
+from piavatar_envs.config import EnvConfig, load_keywords
 from piavatar_envs.config.load import setting_keys
 from piavatar_envs.envs.state import check_state
 from piavatar_envs.envs.task import Task
@@ -240,14 +240,14 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
-            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
             ImportError: ``array_api="torch"`` and torch is not installed.
             ValueError: an unknown task or one that the id is not registered for, an unknown render mode, device, kind
                 of arrays or autoreset mode, or no environments.
         """
         self.render_mode, self.autoreset_mode = check_batch_render_mode(render_mode), _autoreset_mode(autoreset_mode)
         task_class = load_registered(task, registered)
-        self.config = load_config(task_class.Config, config, overrides)
+        self.config = load_keywords(task_class.Config, config, overrides)
         made = {"num_envs": num_envs, "render_mode": render_mode, "device": device, "array_api": array_api}
         made |= {"autoreset_mode": self.autoreset_mode, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarVectorEnv.__init__, task=task_class, **made)

@@ -11,8 +11,8 @@ name, the bare name is enough (``tone``), which lets ``gym.make(ID, fidelity="co
 has one of two sets of settings, by its ``mode``; ``control="pd"`` is short for ``control={"mode": "pd"}``.
 """
 
-from piavatar_envs.config.errors import ConfigError
-from piavatar_envs.config.load import dump_yaml, load_config, parse_assignments, replace
+from piavatar_envs.config.errors import ConfigError, UnexpectedKeyword
+from piavatar_envs.config.load import dump_yaml, load_config, load_keywords, parse_assignments, replace
 from piavatar_envs.config.schema import (
     FROZEN,
     AvatarConfig,
@@ -52,8 +52,10 @@ __all__ = [
     "SceneConfig",
     "ShapeConfig",
     "TorqueControlConfig",
+    "UnexpectedKeyword",
     "dump_yaml",
     "load_config",
+    "load_keywords",
     "parse_assignments",
     "replace",
 ]

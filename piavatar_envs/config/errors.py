@@ -34,6 +34,10 @@ class ConfigError(ValueError):
         return "; ".join(str(part) for part in self.args)
 
 
+class UnexpectedKeyword(ConfigError, TypeError):
+    """A keyword of a call that is no setting; libraries that try their own keywords look for Python's TypeError."""
+
+
 def setting_keys(cls: type[BaseModel]) -> tuple[str, ...]:
     """Return the dotted names of all settings of ``cls``, in order, e.g. ``("physics.fidelity", ..., "obs_mode")``."""
     keys: dict[str, None] = {}

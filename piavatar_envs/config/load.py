@@ -19,6 +19,7 @@ from pydantic.fields import FieldInfo
 
 from piavatar_envs.config.errors import (
     ConfigError,
+    UnexpectedKeyword,
     entry_of,
     error_line,
     models_of,
@@ -78,6 +79,24 @@ def load_config(
     except ValidationError as error:
         given = set(_flat_keys(above))
         raise ConfigError(*(error_line(cls, item, path, given) for item in error.errors(include_url=False))) from None
+
+
+def load_keywords(
+    cls: type[Config], source: Mapping[str, Any] | str | Path | Config | None, keywords: Mapping[str, Any]
+) -> Config:
+    """Build a configuration from the ``config`` and the other keywords of a call; see :func:`load_config`.
+
+    Raises:
+        ConfigError: as :func:`load_config`.
+        UnexpectedKeyword: a keyword is no setting; its message has Python's words for that.
+    """
+    try:
+        return load_config(cls, source, keywords)
+    except ConfigError as error:
+        unknown = [key for key in keywords if _qualified(cls, key).partition(".")[0] not in cls.model_fields]
+        if not unknown:
+            raise
+        raise UnexpectedKeyword(f"got an unexpected keyword argument {unknown[0]!r}", *error.args) from None
 
 
 def replace(config: Config, overrides: Mapping[str, Any] | None = None, /, **settings: Any) -> Config:

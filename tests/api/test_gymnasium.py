@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import warnings
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs.api.gym_env import AvatarEnv
+from piavatar_envs.config import ConfigError
 from tests.api.runs import bytes_of
 
 ROOT = Path(__file__).parents[2]
@@ -46,6 +48,36 @@ def test_bad_settings_are_refused_in_one_line_with_the_alternatives(device, sett
         AvatarEnv(**{"task": "KickBall-v0", "device": device, "fidelity": "tiny", **settings})
     message = str(caught.value)
     assert "\n" not in message and all(word in message for word in words), message
+
+
+@pytest.mark.parametrize("view", ["make", "make_vec", "pettingzoo", "sb3", "skrl", "rsl_rl"])
+def test_an_unknown_keyword_is_a_type_error_too(device, view):
+    """Libraries such as TorchRL try keywords of their own, and look for Python's own words to leave them out."""
+
+    def make(**settings):
+        settings = {"device": device, "fidelity": "tiny", **settings}
+        if view.startswith("make"):
+            return getattr(gymnasium, view)(KICK, **settings)
+        module = importlib.import_module(f"piavatar_envs.api.{view}")
+        name = {
+            "pettingzoo": "AvatarParallelEnv",
+            "sb3": "SB3VecEnv",
+            "skrl": "AvatarSkrlEnv",
+            "rsl_rl": "AvatarRslEnv",
+        }
+        return getattr(module, name[view])("KickBall-v0", **settings)
+
+    if view == "sb3":
+        pytest.importorskip("stable_baselines3")
+    with pytest.raises(
+        TypeError, match=r"got an unexpected keyword argument 'fidelty'; .*physics\.fidelity\?"
+    ) as caught:
+        make(fidelty="tiny")
+    assert isinstance(caught.value, ConfigError) and "\n" not in str(caught.value)
+    for settings in ({"tone": 2.0}, {"control": {"ton": 1.0}}, {"config": {"fidelty": "tiny"}}):
+        with pytest.raises(ConfigError) as caught:
+            make(**settings)
+        assert not isinstance(caught.value, TypeError)
 
 
 def test_a_yaml_file_and_keywords_configure(tmp_path, device):
