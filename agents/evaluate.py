@@ -32,7 +32,6 @@ from agents.intervals import (
     wilson,
 )
 from piavatar_envs.api.host import EpisodeHost
-from piavatar_envs.mpm.types import failure_name
 
 Agent = Callable[[np.ndarray], np.ndarray]
 #: Width of a class of pushes [N s].
@@ -56,7 +55,7 @@ class Episode:
         terminated: whether it ended before its time, as by a fall.
         distance: mean over the steps of the task's ``distance`` [m], where it has one.
         push: greatest impulse of a push [N s], where the task pushes, or None.
-        failure: why the simulation gave up, or None.
+        failure: whether the simulation has failed.
         agent_totals: undiscounted return of every agent of a world, shape ``(agents,)``; None where there is one.
         agent_success: whether each had fulfilled its task in its last step, shape ``(agents,)``, or None.
     """
@@ -69,7 +68,7 @@ class Episode:
     terminated: bool = False
     distance: float = 0.0
     push: float | None = None
-    failure: str | None = None
+    failure: bool = False
     agent_totals: np.ndarray | None = None
     agent_success: np.ndarray | None = None
 
@@ -82,7 +81,7 @@ class Episode:
         self.successes += self.success_at_end
         self.distance += (float(info.get("distance", np.nan)) - self.distance) / self.steps
         self.push = info.get("strongest_push")
-        self.failure = info.get("failure")
+        self.failure = bool(info.get("failure"))
         if "rewards" in info:
             self.agent_totals = info["rewards"] + (0.0 if self.agent_totals is None else self.agent_totals)
             self.agent_success = info["successes"]
@@ -125,7 +124,7 @@ class Evaluation:
             "mean_steps": steps.mean,
             "steps_interval": [steps.low, steps.high],
             "mean_distance_m": distance if np.isfinite(distance) else None,
-            "failures": sum(episode.failure is not None for episode in self.episodes),
+            "failures": sum(episode.failure for episode in self.episodes),
             "episodes": len(self.episodes),
             "first_seed": self.episodes[0].seed,
         }
@@ -279,7 +278,7 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
             rewards, failures = batch.reward(), batch.read(lambda group: group.failure)
             over = batch.read(lambda group: group.terminated).all(axis=1)
             for env in np.flatnonzero(playing):
-                info: dict[str, Any] = {"success": success[env].all(), "failure": failure_name(int(failures[env]))}
+                info: dict[str, Any] = {"success": success[env].all(), "failure": int(failures[env])}
                 info |= {name: float(metrics[env, acted[env], place].mean()) for name, place in places.items()}
                 if batch.num_agents > 1:
                     info |= {"rewards": rewards[env].astype(np.float64), "successes": success[env].copy()}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from piavatar_envs.envs.observations import ObservationTerm
     from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
     from piavatar_envs.mpm.materials import register_material
+    from piavatar_envs.mpm.types import failure_name
     from piavatar_envs.tasks.games import register_game
 
 #: Public names with heavy imports, and the modules that define them.
@@ -29,6 +30,7 @@ _LAZY = {
     "TaskArray": "piavatar_envs.envs.task",
     "Term": "piavatar_envs.envs.task",
     "check_task": "piavatar_envs.api.conformance",
+    "failure_name": "piavatar_envs.mpm.types",
     "register_game": "piavatar_envs.tasks.games",
     "register_material": "piavatar_envs.mpm.materials",
     "register_motion": "piavatar_envs.avatar.motion",
@@ -42,6 +44,7 @@ __all__ = [
     "TaskArray",
     "Term",
     "check_task",
+    "failure_name",
     "register_game",
     "register_material",
     "register_motion",

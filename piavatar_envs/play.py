@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
 from piavatar_envs.core.rng import check_seeds
+from piavatar_envs.mpm.types import failure_name
 from piavatar_envs.multi import load_game
 from piavatar_envs.render.video import check_suffix, write_video
 from piavatar_envs.tasks import listed_name, task_modules
@@ -148,7 +149,7 @@ class JointEnv:
         chosen = {name: actions[index[name]] for name in self.env.agents}
         _, rewards, _, truncations, infos = self.env.step(chosen)
         failures = [info["failure"] for info in infos.values() if info.get("failure")]
-        info = {**infos, "failure": failures[0] if failures else None}
+        info = {**infos, "failure": failures[0] if failures else 0}
         over = not self.env.agents
         return None, sum(rewards.values()), over and not any(truncations.values()), over, info
 
@@ -178,7 +179,7 @@ def _frames(env: gymnasium.Env | JointEnv, agent: str, steps: int | None, seed: 
             rollout.returns[-1] += float(reward)
             rollout.metrics = numbers(info)
             if info.get("failure"):
-                rollout.failures.append(str(info["failure"]))
+                rollout.failures.append(failure_name(info["failure"]))
             yield env.render() if env.render_mode else None
             bar.update()
             finished = terminated or truncated

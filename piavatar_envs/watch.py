@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 
 from piavatar_envs.api.pictures import Live
+from piavatar_envs.envs.task import REWARD
 from piavatar_envs.play import JointEnv, check_agent, make, numbers, settings_of
 from piavatar_envs.render.live import PORT, check_port, import_viser
 from piavatar_envs.render.panel import Panel
@@ -139,9 +140,9 @@ class Show:
         """Fill the table; not in every step, because a browser takes longer for it than for the scene."""
         self._table_at = self._live.pace.clock()
         terms = {
-            name.replace("reward_terms.", ""): f"{value:+.3f}"
+            name.replace(REWARD, ""): f"{value:+.3f}"
             for name, value in numbers(self._info).items()
-            if "reward_terms." in name
+            if name.rpartition(".")[2].startswith(REWARD)
         }
         about = {"step": str(self._steps), "time": f"{self._steps * self._dt:.2f} s", "return": f"{self._return:.2f}"}
         self.panel.show_table(self._name, about | terms)

@@ -16,6 +16,11 @@ import pytest
 SAMPLE = ("PIAvatar/KickBall-v0", "PIAvatar/Stand-v0")
 
 
+def reward_terms(info: dict) -> dict:
+    """Return the terms of the reward in an info, by name."""
+    return {name.removeprefix("reward_"): value for name, value in info.items() if name.startswith("reward_")}
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run a test with ``env_id`` on every registered environment, one with ``sample_id`` on those of ``SAMPLE``.
 

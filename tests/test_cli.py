@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs import cli, doctor, play
+from piavatar_envs.mpm.types import FAILURE_CFL
 from piavatar_envs.tasks import task_modules
 
 PROBE = "PIAvatar/HouseProbe-v0"
@@ -36,9 +37,9 @@ class Probe(gymnasium.Env):
     def step(self, action):
         self.t += 1
         ended = self.t == 3
-        info = {"reward_terms": {"first": float(action[0])}, "wrench": np.zeros(3), "t": np.int64(self.t)}
+        info = {"reward_first": float(action[0]), "wrench": np.zeros(3), "t": np.int64(self.t)}
         if ended:
-            info["failure"] = "probe"
+            info["failure"] = FAILURE_CFL
         return np.zeros(2, np.float32), float(action[0]), ended, False, info
 
     def render(self):
@@ -94,8 +95,8 @@ def test_play_sums_rewards_over_episodes(probe):
     space = gymnasium.spaces.Box(-1, 1, (2,), np.float32, seed=5)
     paid = [float(space.sample()[0]) for _ in range(7)]
     assert rollout.returns == pytest.approx([sum(paid[:3]), sum(paid[3:6]), paid[6]])
-    assert rollout.steps == 7 and rollout.failures == ["probe", "probe"]
-    assert rollout.metrics == {"reward_terms.first": pytest.approx(paid[6]), "t": 1.0}
+    assert rollout.steps == 7 and rollout.failures == ["cfl", "cfl"]
+    assert rollout.metrics == {"reward_first": pytest.approx(paid[6]), "t": 1.0}
     assert probe[0].seeds == [5, None, None]
     one = play.play(PROBE, "zero", overrides={"fidelity": "tiny"})
     assert one.steps == 3 and one.returns == [0.0], "without a number of steps: one episode"
@@ -164,6 +165,6 @@ def test_games_are_played(name):
     cli.check_id(name)
     rollout = play.play(name, agent="zero", steps=3, overrides={"fidelity": "tiny"})
     assert rollout.steps == 3 and len(rollout.returns) == 1 and not rollout.failures
-    assert {"agent_0.success", "agent_1.reward_terms.control"} <= set(rollout.metrics)
+    assert {"agent_0.success", "agent_1.reward_control"} <= set(rollout.metrics)
     with pytest.raises(ValueError, match=r"'sumo_v9'.*sumo_v0"):
         play.play("sumo_v9", steps=1)

@@ -13,6 +13,7 @@ from piavatar_envs import cli, watch
 from piavatar_envs.api.pictures import Live, Pace
 from piavatar_envs.play import make
 from tests.api.test_live import FakeTime
+from tests.conftest import reward_terms
 
 pytest.importorskip("viser", reason='needs pip install "piavatar-envs[live]"')
 
@@ -107,7 +108,7 @@ def test_the_panel_shows_the_reward(open_show):
     show.turn()
     content = table(show)
     assert "PIAvatar/Reach-v0" in content and f"| return | {show._return:.2f} |" in content
-    for name, value in show._info["reward_terms"].items():
+    for name, value in reward_terms(show._info).items():
         assert f"| {name} | {value:+.3f} |" in content
 
 

@@ -60,7 +60,7 @@ class Match:
             "opponent_return_mean": other.mean,
             "opponent_return_interval": [other.low, other.high],
             "mean_steps": float(np.mean([game.steps for game in self.games])),
-            "failures": sum(game.failure is not None for game in self.games),
+            "failures": sum(game.failure for game in self.games),
             "episodes": len(self.games),
             "first_seed": min(game.seed for game in self.games),
         }

@@ -96,7 +96,7 @@ class World(gym.Env):
             "successes": self._successes.copy(),
             "agent_infos": agent_infos,
             "success": bool(self._successes.all()),
-            "failure": next((info["failure"] for info in agent_infos if info.get("failure")), None),
+            "failure": next((info["failure"] for info in agent_infos if info.get("failure")), 0),
         }
         distances = [info["distance"] for info in agent_infos if "distance" in info]
         if distances:

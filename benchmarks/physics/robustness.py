@@ -16,6 +16,7 @@ import numpy as np
 
 from benchmarks import runner
 from piavatar_envs.core.arrays import matrices_of
+from piavatar_envs.mpm.types import failure_name
 from piavatar_envs.tasks import task_modules
 
 
@@ -36,7 +37,7 @@ def numbers(value: object) -> Iterator[float]:
     if isinstance(value, dict):
         for entry in value.values():
             yield from numbers(entry)
-    elif value is not None and not isinstance(value, str):
+    else:
         yield from np.ravel(np.asarray(value, dtype=np.float64))
 
 
@@ -57,7 +58,7 @@ def run_seed(env: gymnasium.Env, seed: int, steps: int) -> dict:
         nonfinite += int(not np.isfinite(list(numbers([observation]))).all())
         nonfinite += int(not np.isfinite(list(numbers({"reward": reward, "info": info}))).all())
         if info["failure"]:
-            failures[info["failure"]] += 1
+            failures[failure_name(info["failure"])] += 1
         stretch = np.linalg.norm(matrices_of(state.F)[0] - np.eye(3, dtype=np.float32), axis=(1, 2))
         strain = max(strain, float(stretch.max()))
         speed = max(speed, float(np.linalg.norm(state.u.numpy()[0], axis=1).max()))

@@ -173,10 +173,11 @@ class NumpyArrays:
         return np.nan_to_num(values, posinf=0.0, neginf=0.0)
 
     def shown(self, values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-        """Copy ``values``, numbers in double precision as in Gymnasium's own vectors."""
-        values = values.astype(np.float64 if values.ndim == 1 and values.dtype.kind == "f" else values.dtype)
+        """Copy ``values``, numbers in 64 bits as in Gymnasium's own vectors."""
+        wide = {"f": np.float64, "i": np.int64} if values.ndim == 1 else {}
+        values = values.astype(wide.get(values.dtype.kind, values.dtype))
         if mask is not None:
-            values[~mask] = None if values.dtype == object else 0
+            values[~mask] = 0
         return values
 
     def repeated(self, mask: np.ndarray | None, num_envs: int, count: int) -> np.ndarray:

@@ -23,9 +23,10 @@ class AvatarEnv(SingleView, gym.Env):
     terms. Actions are in [-1, 1], one component for each of ``action_names``. The setting ``control`` makes them
     increments of joint rotations, joint targets or joint torques.
 
-    ``info`` holds the reward's terms (``info["reward_terms"]``), the task's metrics, ``success``, ``failure`` and the
-    root wrench. ``failure`` is None, or the reason why the simulation has failed: then ``terminated`` is True and the
-    next reset begins a new episode.
+    ``info`` holds numbers, booleans and vectors, under the same keys after a reset and after a step: ``success``,
+    ``failure``, the root wrench, the task's metrics, the reward's terms (``reward_<name>``) and those of the cost
+    (``cost_<name>``). Metrics and terms are zero after a reset. ``failure`` is 0, or a code whose cause
+    :func:`piavatar_envs.failure_name` names: then ``terminated`` is True and the next reset begins a new episode.
 
     Attributes:
         host: holds the environment.

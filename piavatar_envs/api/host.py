@@ -4,30 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
 import numpy as np
 import warp as wp
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 
 from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.pictures import Live, Pictures
 from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.config import EnvConfig
+from piavatar_envs.config import replace as replace_settings
 from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.core.rng import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.envs.state import add_forces, check_settings, check_state, has_forces
-from piavatar_envs.envs.task import Task
-from piavatar_envs.mpm.types import failure_name
+from piavatar_envs.envs.task import COST, REWARD, Task
 from piavatar_envs.sim.world import check_device
 
 #: Types in which settings are given.
 Settings = EnvConfig | Mapping[str, Any] | str | Path | None
+Limited = TypeVar("Limited", bound=EnvConfig)
 
 
 class EpisodeHost:
@@ -289,7 +291,7 @@ class EpisodeHost:
     def status(self, agent: int) -> dict[str, Array]:
         """Return the part of an agent's info that holds at any time, a row an environment.
 
-        ``failure`` are bits ``FAILURE_*``.
+        ``failure`` is a code, see :func:`piavatar_envs.failure_name`.
         """
 
         def drive(name: str) -> Array:
@@ -304,20 +306,23 @@ class EpisodeHost:
             "root_released": drive("released") != 0,
         }
 
-    def outcome(self, agent: int) -> dict[str, Any]:
-        """Return the part of an agent's info that a step adds: metrics, reward and cost terms, a row an environment."""
+    def outcome(self, agent: int) -> dict[str, Array]:
+        """Return the part of an agent's info that is of the last step, a row an environment.
 
-        def named(names: tuple[str, ...], array_of: Callable[[BatchEnv], wp.array]) -> dict[str, Array]:
+        That is metrics, the terms of the reward as ``reward_<name>``, ``cost`` and its terms as ``cost_<name>``.
+        """
+
+        def named(names: Sequence[str], prefix: str, array_of: Callable[[BatchEnv], wp.array]) -> dict[str, Array]:
             # an array without names has one column without meaning
             values = self.read(array_of)[:, agent] if names else None
-            return {name: values[:, index] for index, name in enumerate(names)}
+            return {f"{prefix}{name}": values[:, index] for index, name in enumerate(names)}
 
         task = self.task
-        found: dict[str, Any] = named(task.metric_names, lambda batch: batch.metrics)
-        found["reward_terms"] = named(task.reward_names, lambda batch: batch.terms)
+        found = named(task.metric_names, "", lambda batch: batch.metrics)
+        found |= named(task.reward_names, REWARD, lambda batch: batch.terms)
         if task.costs:
             found["cost"] = self.read(lambda batch: batch.cost)[:, agent]
-            found["cost_terms"] = named(task.cost_names, lambda batch: batch.cost_terms)
+            found |= named(task.cost_names, COST, lambda batch: batch.cost_terms)
         return found
 
     # state
@@ -480,7 +485,8 @@ class Transition:
         infos = self.infos
         shown = {"Task/success": [info["success"].float() for info in infos]}
         shown |= {f"Task/{name}": [info[name] for info in infos] for name in metrics}
-        shown |= {f"Reward/{name}": [info["reward_terms"][name] for info in infos] for name in infos[0]["reward_terms"]}
+        names = [key.removeprefix(REWARD) for key in infos[0] if key.startswith(REWARD)]
+        shown |= {f"Reward/{name}": [info[f"{REWARD}{name}"] for info in infos] for name in names}
         return {
             name: sum(value.nan_to_num(0.0, 0.0, 0.0).mean() for value in values) / len(infos)
             for name, values in shown.items()
@@ -503,6 +509,7 @@ class HostView:
     """
 
     host: EpisodeHost
+    _spec: EnvSpec | None = None
     _build: Callable[[Any], None]
     _built: ClassVar[tuple[str, ...]] = ("host", "closed")
 
@@ -587,9 +594,12 @@ class SingleView(HostView):
         return self.host.named(self.host.observation()[0, agent])
 
     def _info(self, agent: int, stepped: bool = False) -> dict[str, Any]:
-        """Return the info of an agent, with the outcome of the last step where there was one."""
-        outcome = self.host.outcome(agent) if stepped else {}
-        return _first_row(self.host.status(agent) | outcome)
+        """Return the info of an agent as Python's numbers and vectors; the outcome of a step is zero at a reset."""
+        outcome = self.host.outcome(agent)
+        if not stepped:
+            outcome = {name: np.zeros_like(value) for name, value in outcome.items()}
+        values = self.host.status(agent) | outcome
+        return {name: value[0] if value.ndim > 1 else value[0].item() for name, value in values.items()}
 
     def render(self) -> np.ndarray | None:
         """Draw the scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``; else return None.
@@ -620,29 +630,6 @@ def checked_seed(seed: Any) -> int:
         check_seeds(seed)  # first, because Gymnasium raises its own Error for a negative one
     seeding.np_random(seed)
     return seed
-
-
-def failure_names(bits: Array) -> Array:
-    """Return the names of failures, None for none; of tensors the bits, which need no copy to the host."""
-    if not isinstance(bits, np.ndarray):
-        return bits
-    names = np.full(len(bits), None, object)
-    for env in np.flatnonzero(bits):
-        names[env] = failure_name(int(bits[env]))
-    return names
-
-
-def _first_row(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the only environment's values as Python's numbers, vectors as arrays."""
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            found[name] = _first_row(value)
-        elif name == "failure":
-            found[name] = failure_names(value)[0]
-        else:
-            found[name] = value[0] if value.ndim > 1 else value[0].item()
-    return found
 
 
 def _unbounded(size: int) -> gym.spaces.Box:

@@ -107,8 +107,8 @@ class AvatarSkrlEnv(HostView):
 
         Returns:
             ``{"policy": observation}``, then reward, terminated and truncated, each ``(num_envs,)``, and the info:
-            beside the final observation the task's metrics, ``reward_terms``, ``success``, ``failure`` (bits) and the
-            root's wrench, a row an environment.
+            beside the final observation the entries of Gymnasium's view (metrics, ``reward_<name>``, ``success``,
+            ``failure``, ...), a row an environment.
 
         Raises:
             ValueError: actions of a wrong shape, type or device; nothing has changed then.
@@ -144,7 +144,7 @@ class AvatarSkrlMultiEnv(HostView):
     - ``infos["alive"][agent]`` ``(num_envs,)`` bool: it acts in the next step.
     - ``infos["final_obs"][agent]``, ``infos["final_state"]``: the observations to which the step led, also where the
       environment was reset (``infos["_final_obs"]``, ``(num_envs,)`` bool); elsewhere the same as those returned.
-    - ``infos[agent]``: metrics, ``reward_terms``, ``success``, ``failure`` (bits) and the root's wrench, a row for
+    - ``infos[agent]``: metrics, ``reward_<name>``, ``success``, ``failure`` and the root's wrench, a row for
       each environment.
 
     All tensors are copies on ``device``.

@@ -189,8 +189,8 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
     Environment ``i`` equals the single environment of seed ``seed + i``, bit for bit. Infos have Gymnasium's vector
     format: arrays, and beside each ``name`` the mask ``_name`` of the environments that it holds for. With
     ``array_api="torch"`` all arrays are tensors on the environments' device and :meth:`step` never makes the host wait;
-    then ``info["failure"]`` are bits (``piavatar_envs.mpm.types.failure_name`` returns their names), and under
-    SAME_STEP ``info["final_obs"]`` is a whole batch of observations, of which ``_final_obs`` marks those that ended.
+    then ``info["final_obs"]`` under SAME_STEP is a whole batch of observations, of which ``_final_obs`` marks those
+    that ended.
 
     At the end of an episode ``metadata["autoreset_mode"]`` applies, as Gymnasium defines it. :meth:`step` returns the
     terminal observation, except under SAME_STEP, where it is in ``info["final_obs"]``:
@@ -289,7 +289,8 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
             del options["reset_mask"]  # after the reset, so that a refused call changes nothing
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         held = None if mask is None else self.host.api.from_host(mask)
-        return self._observation(), self._in_vector_format(self.host.status(0), held)
+        none = self.host.api.from_host(np.zeros(self.num_envs, bool))
+        return self._observation(), self._in_vector_format(self._info(none), held)
 
     def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray | None:
         """Return the mask in ``options``, if there is one."""
@@ -336,7 +337,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
             return self._step_and_reset(actions)
         self._check_none_ended()
         host.advance(actions)
-        return self._observation(), *self._ends(), self._in_vector_format(host.status(0) | host.outcome(0))
+        return self._observation(), *self._ends(), self._in_vector_format(self._info())
 
     def _step_or_reset(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Step, and reset the environments that ended in the step before (NEXT_STEP).
@@ -348,9 +349,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         host.advance(actions)
         host.reset_ended()
         reward, terminated, truncated = self._ends()
-        infos = self._in_vector_format(host.status(0))
-        if host.api.may_hold(~ended):
-            infos |= self._in_vector_format(host.outcome(0), ~ended)
+        infos = self._in_vector_format(self._info(~ended))
         return self._observation(), host.api.shown(reward, ~ended), terminated, truncated, infos
 
     def _step_and_reset(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
@@ -359,14 +358,14 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         api = host.api
         host.advance(actions)
         ended, observation, ends = host.find_ended(), self._observation(), self._ends()
-        outcome = host.outcome(0)
-        infos = self._in_vector_format(outcome, ~ended) if api.may_hold(~ended) else {}
+        infos: dict[str, Any] = {}
         if api.may_hold(ended):
             infos["final_obs"], infos["_final_obs"] = api.rows(observation, ended), api.shown(ended)
+        outcome = host.outcome(0)
             infos |= self._in_vector_format({"final_info": host.status(0) | outcome}, ended)
             host.reset_ended()
             observation = self._observation()
-        return observation, *ends, infos | self._in_vector_format(host.status(0))
+        return observation, *ends, infos | self._in_vector_format(self._info(~ended, outcome))
 
     def _check_none_ended(self) -> None:
         """Refuse a step after the end of an episode (DISABLED), where the arrays are on the host."""
@@ -386,11 +385,16 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         host = self.host
         return host.api.shown(host.reward()[:, 0]), host.terminated()[:, 0], host.truncated()
 
-    def _in_vector_format(self, values: dict[str, Any], mask: Array | None = None) -> dict[str, Any]:
-        """Format values by name as Gymnasium's vectors do: zeros outside ``mask``, and a mask ``_name`` beside each.
+    def _info(self, stepped: Array | None = None, outcome: dict[str, Array] | None = None) -> dict[str, Array]:
+        """Return the infos, a row an environment; the outcome of the last step is zero where ``stepped`` is False."""
+        host = self.host
+        outcome = host.outcome(0) if outcome is None else outcome
+        if stepped is not None:
+            outcome = {name: host.api.shown(value, stepped) for name, value in outcome.items()}
+        return host.status(0) | outcome
 
-        Failures become names (None for none) in NumPy's arrays; a tensor keeps the bits.
-        """
+    def _in_vector_format(self, values: dict[str, Any], mask: Array | None = None) -> dict[str, Any]:
+        """Format values by name as Gymnasium's vectors do: zeros outside ``mask``, and a mask ``_name`` beside each."""
         api = self.host.api
         masks = iter(api.repeated(mask, self.num_envs, _count(values)))
 
@@ -400,7 +404,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
                 if isinstance(value, Mapping):
                     found[name] = put(value)
                 else:
-                    found[name] = api.shown(failure_names(value) if name == "failure" else value, mask)
+                    found[name] = api.shown(value, mask)
                 found[f"_{name}"] = next(masks)
             return found
 

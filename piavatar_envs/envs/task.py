@@ -28,9 +28,11 @@ if TYPE_CHECKING:
     from piavatar_envs.envs.episodes import EpisodeArrays
     from piavatar_envs.render.scene import Marker
 
+#: Prefixes of the terms of reward and cost in ``info``; no metric's name can begin with one.
+REWARD, COST = "reward_", "cost_"
 #: Keys of every environment's ``info`` and of its views; no metric can have these names.
 NAMES_OF_INFO = (
-    "success", "failure", "root_force", "root_torque", "root_released", "reward_terms", "cost", "cost_terms",
+    "success", "failure", "root_force", "root_torque", "root_released", "cost",
     "final_info", "final_obs", "final_state", "episode", "is_success", "terminal_observation", "TimeLimit.truncated",
     "acted", "alive", "time_outs", "log",
 )  # fmt: skip
@@ -41,7 +43,7 @@ class Term:
     """A named part of the reward or of the cost.
 
     Attributes:
-        name: key in ``info["reward_terms"]`` or ``info["cost_terms"]``.
+        name: its key in ``info`` is ``reward_<name>`` or ``cost_<name>``.
         description: its value, with the settings that shape it (Markdown, for the task's page).
     """
 
@@ -170,6 +172,12 @@ class Task:
         cls.reward_names = cls._names("rewards", Term)
         cls.cost_names = cls._names("costs", Term)
         cls.metric_names = cls._names("metrics", Metric, NAMES_OF_INFO, "info has that key anyway")
+        for name in cls.metric_names:
+            if name.startswith((REWARD, COST)):
+                raise ValueError(
+                    f"{cls.__name__}.metrics has {name!r}, but info has terms of reward and cost under "
+                    f"'{REWARD}' and '{COST}'; choose a name that begins otherwise"
+                )
         cls.rewards, cls.costs, cls.metrics = Columns(cls.rewards), Columns(cls.costs), Columns(cls.metrics)
         taken = (*dir(cls), "config", "joints", "scene")
         state = cls._names("state_arrays", TaskArray, taken, "the task has that attribute")

@@ -50,7 +50,11 @@ NO_STRESS = wp.constant(3)
 
 
 def failure_name(bits: int) -> str | None:
-    """Return the causes of a failure joined by ``+``, ``None`` if there is none."""
+    """Return the causes of a failure joined by ``+``, ``None`` if there is none.
+
+    Args:
+        bits: the code ``info["failure"]``, a sum of the keys of :data:`FAILURE_NAMES`; 0 for none.
+    """
     names = [name for bit, name in FAILURE_NAMES.items() if bits & bit]
     return "+".join(names) or None
 

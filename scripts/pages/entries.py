@@ -64,13 +64,12 @@ class Facts:
         task: the task at its default settings.
         layout: of the flat observation.
         agents: names of the agents; empty for a Gymnasium environment.
-        reset_info, info: an agent's ``info`` after a reset, and after a step.
+        info: an agent's, after a step.
     """
 
     task: Task
     layout: ObservationLayout
     agents: tuple[str, ...]
-    reset_info: Mapping[str, Any]
     info: Mapping[str, Any]
 
     @property
@@ -101,12 +100,12 @@ def entries() -> list[Entry]:
 
 def gather(entry: Entry, env: Any) -> Facts:
     """Reset and step an environment of ``entry``, at any resolution, and return its facts."""
-    _, reset_info = env.reset(seed=0)
+    env.reset(seed=0)
     _, _, _, _, info = step(env, np.zeros(env.batch.action_spec.size, np.float32))
     agents = tuple(env.possible_agents) if entry.multi else ()
     if agents:
-        reset_info, info = reset_info[agents[0]], info[agents[0]]
-    return Facts(entry.task(entry.task.Config()), env.batch.layout, agents, reset_info, info)
+        info = info[agents[0]]
+    return Facts(entry.task(entry.task.Config()), env.batch.layout, agents, info)
 
 
 def step(env: Any, action: np.ndarray) -> tuple:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
-from piavatar_envs.envs.task import Term
+from piavatar_envs.envs.task import COST, REWARD, Term
 from piavatar_envs.mpm.types import FAILURE_NAMES
 from scripts.pages.actions import actions_section
 from scripts.pages.entries import ROOT, Entry, Facts
@@ -32,13 +32,11 @@ FRAMES = {
 #: Keys that the views put into ``info`` beside the task's metrics.
 INFO_DOCS = {
     "success": "whether the state is a success, see above",
-    "failure": "reason for which the simulation has failed; `None` while it has not",
+    "failure": "code of the cause for which the simulation has failed; 0 while it has not",
     "root_force": "force of the root wrench on the body, its mean over the step, in the world [N]",
     "root_torque": "its torque about the body's centre of mass [N m]",
     "root_released": "whether the root wrench has been released, which lasts until the end of the episode",
-    "reward_terms": "the terms of the reward by name",
     "cost": "sum of the cost terms",
-    "cost_terms": "the cost terms by name",
 }
 FAILURE_DOCS = {
     "nonfinite": "a velocity or a deformation is not finite",
@@ -199,8 +197,11 @@ def _episode(entry: Entry, facts: Facts) -> str:
             f"{number(control.release_distance)} m horizontally (`release_distance`) or "
             f"{number(control.release_height)} m in height (`release_height`)"
         )
-    failures = ", ".join(f"{code(name)} ({FAILURE_DOCS[name]})" for name in FAILURE_NAMES.values())
-    ends.append(f'the simulation fails; `info["failure"]` gives the reason: {failures}')
+    failures = ", ".join(f"{bit} {code(name)} ({FAILURE_DOCS[name]})" for bit, name in FAILURE_NAMES.items())
+    ends.append(
+        f'the simulation fails; `info["failure"]` is the sum of its causes: {failures}; '
+        "`piavatar_envs.failure_name` spells it"
+    )
     return page(
         [
             "## Episode",
@@ -213,21 +214,20 @@ def _episode(entry: Entry, facts: Facts) -> str:
 
 def info_docs(entry: Entry) -> dict[str, str]:
     """Return the meaning of every known key of ``info``."""
-    return INFO_DOCS | {one.name: f"{one.description} [{one.unit}]" for one in entry.task.metrics}
+    task = entry.task
+    terms = {f"{REWARD}{name}": f"term {code(name)} of the reward" for name in task.reward_names}
+    terms |= {f"{COST}{name}": f"term {code(name)} of the cost" for name in task.cost_names}
+    return INFO_DOCS | terms | {one.name: f"{one.description} [{one.unit}]" for one in task.metrics}
 
 
 def _info(entry: Entry, facts: Facts) -> str:
     docs = info_docs(entry)
-    rows = [
-        (code(key), _type_name(value), docs.get(key, ""), "" if key in facts.reset_info else "after a step")
-        for key, value in facts.info.items()
-    ]
-    return page(["## Info", table(("key", "type", "meaning", "present"), rows)])
+    rows = [(code(key), _type_name(value), docs.get(key, "")) for key, value in facts.info.items()]
+    text = "The same keys after a reset, when metrics and the terms of reward and cost are zero, and after a step."
+    return page(["## Info", text, table(("key", "type", "meaning"), rows)])
 
 
 def _type_name(value: object) -> str:
-    if value is None:
-        return "str or None"
     if isinstance(value, np.ndarray):
         return f"{value.dtype} {value.shape}"
     return type(value).__name__

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 
 from piavatar_envs.api.gym_env import AvatarEnv
 from piavatar_envs.api.vector_env import AvatarVectorEnv
+from piavatar_envs.mpm.types import FAILURE_NONFINITE
 from piavatar_envs.tasks import load_task, task_modules
 from tests.api.runs import SHORT, actions_of, arrays_in, on_host
 
@@ -91,7 +92,7 @@ def test_a_failed_run_is_copied(make_env, same):
     state = env.get_state()
     state["particles.x"][0, 5] = np.nan
     env.set_state(state)
-    assert env.step(actions_of(env, 1)[0])[4]["failure"] == "nonfinite"
+    assert env.step(actions_of(env, 1)[0])[4]["failure"] == FAILURE_NONFINITE
     assert not np.isfinite(env.get_state()["particles.x"]).all()
     assert_copies_continue(env, same)
 

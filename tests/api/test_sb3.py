@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from piavatar_envs.mpm.types import FAILURE_CFL
+
 pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -65,9 +67,9 @@ def test_a_failure_is_not_a_truncation(make_sb3):
     vector.vector.set_state(state)
     vector.reset_infos = [{}, {}]
     _, _, done, infos = vector.step(np.zeros((2, *vector.action_space.shape)))
-    assert done.tolist() == [False, True] and infos[1]["failure"] == "cfl"
+    assert done.tolist() == [False, True] and infos[1]["failure"] == FAILURE_CFL
     assert infos[1]["TimeLimit.truncated"] is False and infos[1]["is_success"] is False
-    assert not vector.reset_infos[0] and vector.reset_infos[1]["failure"] is None
+    assert not vector.reset_infos[0] and vector.reset_infos[1]["failure"] == 0
 
 
 def test_infos_of_steps_can_be_left_out(make_sb3):
@@ -78,7 +80,7 @@ def test_infos_of_steps_can_be_left_out(make_sb3):
     for step in range(6):
         rows = [env.step(np.zeros((2, *env.action_space.shape)))[3] for env in (brief, full)]
         assert all(bool(info) == (step == 5) for info in rows[0]) and all(rows[1])
-    assert rows[0][0].keys() == rows[1][0].keys() and "reward_terms" in rows[0][0]
+    assert rows[0][0].keys() == rows[1][0].keys() and "reward_reach" in rows[0][0]
 
 
 def test_monitors_count_episodes(make_sb3):

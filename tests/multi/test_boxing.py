@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index
 from piavatar_envs.envs.episodes import Episodes
 from piavatar_envs.mpm.types import Sensors
+from tests.conftest import reward_terms
 
 BOXING = "boxing_v0"
 PARTS = tuple(BODY_PARTS)
@@ -140,8 +141,8 @@ def test_a_straight_right_scores(make_game):
     game = make_game(BOXING, **SOFT)
     game.reset(seed=0)
     log = strike(game)
-    hits = [row[4]["agent_0"]["reward_terms"]["hit"] for row in log]
-    taken = [row[4]["agent_1"]["reward_terms"]["taken"] for row in log]
+    hits = [row[4]["agent_0"]["reward_hit"] for row in log]
+    taken = [row[4]["agent_1"]["reward_taken"] for row in log]
     assert sum(hits) > 0.4 and log[-1][4]["agent_0"]["score"] == pytest.approx(sum(hits), abs=1e-5)
     assert taken == pytest.approx([-game.config.taken_weight * hit for hit in hits], abs=1e-6)
     for row in log:
@@ -180,7 +181,7 @@ def test_an_agent_that_is_down_is_out_whatever_its_points(make_game, play, setti
     assert list(terminations.values()) == [True, not goes_on, not goes_on][: len(terminations)]
     assert game.agents == (["agent_1", "agent_2"] if goes_on else [])
     assert [info["success"] for info in infos.values()] == [False, not goes_on, False][: len(infos)]
-    terms = [infos[name]["reward_terms"] for name in ("agent_0", "agent_1")]
+    terms = [reward_terms(infos[name]) for name in ("agent_0", "agent_1")]
     assert [term["down"] for term in terms] == [-game.config.down_cost, 0.0]
     assert [term["win"] for term in terms] == [0.0, 0.0 if goes_on else game.config.win_reward]
 
@@ -212,6 +213,6 @@ def test_the_ropes_hold(make_game, play, settings):
     dx, farthest = game.batch.simulation.dx, []
     for _ in range(30):
         [(*_, infos)] = play(game, 1, **({} if settings else {"root.y": 1.0}))
-        assert infos["agent_0"]["failure"] is None and len(game.agents) == 2
+        assert infos["agent_0"]["failure"] == 0 and len(game.agents) == 2
         farthest.append(np.abs(game.batch.simulation.state.x.numpy()[0, :, 1]).max())
     assert 1.1 - dx < max(farthest) < 1.1 + 0.5 * dx

@@ -51,7 +51,7 @@ def test_the_agent_that_falls_loses_and_the_one_that_stands_wins(make_game, modu
     help_only(game, 1)
     for _ in range(90):
         _, rewards, terminations, truncations, infos = game.step(still(game))
-        assert infos["agent_0"]["failure"] is None and not any(truncations.values())
+        assert infos["agent_0"]["failure"] == 0 and not any(truncations.values())
         assert terminations["agent_0"] == is_down(game, 0) and not is_down(game, 1)
         if terminations["agent_0"]:
             break
@@ -59,7 +59,7 @@ def test_the_agent_that_falls_loses_and_the_one_that_stands_wins(make_game, modu
     assert terminations == {"agent_0": True, "agent_1": True} and not game.agents
     assert [infos[name]["success"] for name in ("agent_0", "agent_1")] == [False, True]
     lost = {SUMO: "out", BOXING: "down"}[module]
-    assert infos["agent_0"]["reward_terms"][lost] < -4.0 and infos["agent_1"]["reward_terms"]["win"] > 4.0
+    assert infos["agent_0"][f"reward_{lost}"] < -4.0 and infos["agent_1"]["reward_win"] > 4.0
     assert rewards["agent_0"] < -4.0 and rewards["agent_1"] > 4.0
     assert not any(info["root_released"] for info in infos.values()) and not infos["agent_0"]["root_force"].any()
 

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.mpm.types import FAILURE_CFL, FAILURE_OUT_OF_GRID
+from tests.conftest import reward_terms
+
 SUMO = "sumo_v0"
 STILL = {"pose_noise": 0.0, "place_noise": 0.0}
 
@@ -73,9 +76,9 @@ def test_walking_out_of_the_ring_loses_and_the_last_one_in_wins(make_game, play)
     assert rim[-1] < 0.0 and min(rim[:-1]) >= 0.0
     assert terminations == {"agent_0": True, "agent_1": True} and not any(truncations.values())
     assert [infos[name]["success"] for name in ("agent_0", "agent_1")] == [False, True]
-    assert infos["agent_0"]["reward_terms"]["out"] == -game.config.out_cost
-    assert infos["agent_1"]["reward_terms"]["win"] == game.config.win_reward
-    assert infos["agent_0"]["reward_terms"]["win"] == infos["agent_1"]["reward_terms"]["out"] == 0.0
+    assert infos["agent_0"]["reward_out"] == -game.config.out_cost
+    assert infos["agent_1"]["reward_win"] == game.config.win_reward
+    assert infos["agent_0"]["reward_win"] == infos["agent_1"]["reward_out"] == 0.0
     assert not infos["agent_0"]["root_released"]
 
 
@@ -101,7 +104,7 @@ def test_a_failure_makes_no_winner(make_game, play):
     state["particles.u"][0, 0] = 1e6
     game.set_state(state)
     [(_, rewards, terminations, _, infos)] = play(game, 1)
-    assert all(terminations.values()) and infos["agent_0"]["failure"] == "cfl"
+    assert all(terminations.values()) and infos["agent_0"]["failure"] == FAILURE_CFL
     assert not any(info["success"] for info in infos.values()) and max(np.abs(list(rewards.values()))) < 0.1
 
 
@@ -133,7 +136,7 @@ def test_the_game_goes_on_without_agents_that_are_out(make_game, play, same):
     assert all(set(row[0]) == {"agent_0", "agent_2", "agent_3"} for row in rows)
     assert game.batch.reward.numpy()[0, 1] == 0.0 and not game.batch.terms.numpy()[0, 1].any()
     assert pelvises(game)[1, 2] < height - 0.05, "nothing holds it"
-    assert rows[-1][4]["agent_0"]["failure"] is None
+    assert rows[-1][4]["agent_0"]["failure"] == 0
     # the others see that it is out, counted on from themselves
     for name, expected in (("agent_0", [0, 1, 1]), ("agent_2", [1, 1, 0]), ("agent_3", [1, 0, 1])):
         assert game.observation_layout.split(rows[-1][0][name])["others_in"].tolist() == expected
@@ -159,7 +162,7 @@ def test_rewards_and_the_observed_ring_are_those_of_numpy(make_game):
         observations, _, _, _, infos = game.step(actions)
         away = np.minimum(np.linalg.norm(pelvises(game)[:, :2], axis=1), radius)
         for index, name in enumerate(game.possible_agents):
-            terms, seen = infos[name]["reward_terms"], game.observation_layout.split(observations[name])
+            terms, seen = reward_terms(infos[name]), game.observation_layout.split(observations[name])
             lead = (np.delete(away, index).mean() - away[index]) / radius
             assert terms["push"] == pytest.approx(0.5 * lead, abs=1e-5)
             control = -game.config.control_cost * np.mean(np.clip(actions[name], -1.0, 1.0) ** 2)
@@ -261,4 +264,4 @@ def test_the_walls_keep_an_agent_that_is_thrown_out(make_game, play, walls):
         assert max(reached) < side + 0.5 * dx and len(game.agents) == 3
         assert np.linalg.norm(pelvises(game)[1, :2]) > game.config.ring_radius
     else:
-        assert rows[-1][4]["agent_0"]["failure"] == "out_of_grid"
+        assert rows[-1][4]["agent_0"]["failure"] == FAILURE_OUT_OF_GRID

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 
 from benchmarks.physics import robustness
+from piavatar_envs.mpm.types import FAILURE_NONFINITE
 from piavatar_envs.tasks import task_modules
 
 #: Tasks on the ground: hands of tiny bodies are too thin to be struck on it with all their strength.
@@ -42,9 +43,9 @@ class Spoiled(gymnasium.Wrapper):
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.count += 1
         if self.count % 5 == 0:
-            terminated, info["failure"] = True, "nonfinite"
+            terminated, info["failure"] = True, FAILURE_NONFINITE
         if self.count % 3 == 0:
-            info["reward_terms"]["control"] = np.nan
+            info["reward_control"] = np.nan
         return observation, reward, terminated, truncated, info
 
     @property

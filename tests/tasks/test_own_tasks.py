@@ -156,7 +156,7 @@ def test_a_registered_task_is_an_environment_like_all_others(elsewhere, device):
     same = AvatarEnv(found, fidelity="tiny", device=device)
     assert np.array_equal(same.reset(seed=3)[0], one)
     *_, info = env.step(np.zeros(env.action_space.shape))
-    assert info["reward_terms"]["height"] == pytest.approx(info["best"], abs=0.05) and info["best"] > 0.7
+    assert info["reward_height"] == pytest.approx(info["best"], abs=0.05) and info["best"] > 0.7
     spec = env.spec
     assert spec.max_episode_steps is None
     for name in ("Elsewhere/Balance-v0", "other_tasks:BalanceTask", found):
@@ -207,7 +207,7 @@ def test_a_registered_game_is_listed_loaded_played_and_built(elsewhere, device):
     assert total > 2.0 and acted(game.parallel_env(**settings)) == total
     cli.check_id("other_games:apart_v0")
     rollout = play.play("other_games:apart_v0", steps=2, device=device, overrides={"fidelity": "tiny"})
-    assert rollout.steps == 2 and "agent_1.reward_terms.distance" in rollout.metrics
+    assert rollout.steps == 2 and "agent_1.reward_distance" in rollout.metrics
 
 
 def test_a_file_in_the_folders_of_the_package_is_found(dropped_in, device):
@@ -222,7 +222,7 @@ def test_a_file_in_the_folders_of_the_package_is_found(dropped_in, device):
 
 def test_the_command_line_plays_it(elsewhere, capsys):
     cli.main(["play", BALANCE, "--steps", "1", "-c", "fidelity=tiny"])
-    assert "reward_terms.height" in capsys.readouterr().out and "Elsewhere/Balance-v0" in cli.registered_ids()
+    assert "reward_height" in capsys.readouterr().out and "Elsewhere/Balance-v0" in cli.registered_ids()
     with pytest.raises(SystemExit):
         cli.main(["play", "no_such_module:Elsewhere/Balance-v0"])
     assert "no_such_module" in capsys.readouterr().err

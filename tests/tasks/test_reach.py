@@ -71,7 +71,7 @@ def test_distances_reward_and_success_are_those_of_numpy(make_env):
             assert (info["left_distance"], info["right_distance"]) == pytest.approx(tuple(distances), abs=2e-5)
             assert info["distance"] == pytest.approx(distances.min(), abs=2e-5)
             reach = tolerance(distances.min(), env.config.target_radius, env.config.margin)
-            assert info["reward_terms"]["reach"] == pytest.approx(reach, abs=2e-4)
+            assert info["reward_reach"] == pytest.approx(reach, abs=2e-4)
             if abs(distances.min() - env.config.target_radius) > 1e-4:
                 assert info["success"] == (distances.min() < env.config.target_radius)
             successes.add(info["success"])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
+from tests.conftest import reward_terms
 from tests.tasks.measured import joints, pelvis, seen, still, tolerance
 
 STAND, PUSH, WALK = "PIAvatar/Stand-v0", "PIAvatar/PushRecovery-v0", "PIAvatar/Walk-v0"
@@ -100,7 +101,7 @@ def test_reward_metrics_and_falls_are_what_the_joints_say(make_env, task, settin
     for _ in range(60):
         observation, _, terminated, _, info = env.step(still(env))
         head, pelvis_height, tilt = shares(env)
-        high, terms = tolerance(1.0 - head, 0.05, rule.height_margin), info["reward_terms"]
+        high, terms = tolerance(1.0 - head, 0.05, rule.height_margin), reward_terms(info)
         assert info["head_height"] == pytest.approx(head, abs=1e-5)
         assert info["pelvis_height"] == pytest.approx(pelvis_height, abs=1e-5)
         assert info["tilt_deg"] == pytest.approx(np.degrees(tilt), abs=0.05)

@@ -14,6 +14,7 @@ from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.common.gait import GAIT_POSTURE
+from tests.conftest import reward_terms
 from tests.tasks.measured import joints, pelvis, seen, still, tolerance
 
 WALK = "PIAvatar/Walk-v0"
@@ -26,7 +27,7 @@ ANKLES, SHOULDERS, ELBOWS, WRISTS = (
 def gait_terms(env, steps: int, action=None) -> list[dict]:
     """Return the reward terms of an episode's first steps."""
     env.reset(seed=0)
-    return [env.step(still(env) if action is None else action)[4]["reward_terms"] for _ in range(steps)]
+    return [reward_terms(env.step(still(env) if action is None else action)[4]) for _ in range(steps)]
 
 
 def drift(env, velocity) -> None:
@@ -55,7 +56,7 @@ def test_walking_is_measured_along_the_way(make_env, avatar):
         assert info["distance"] == pytest.approx(gone, abs=1e-4)
         assert info["mean_speed"] == pytest.approx(gone / ((step + 1) / 30.0), abs=1e-3)
         assert not terminated and info["speed"] == pytest.approx(1.0, abs=0.1)
-        assert info["reward_terms"]["speed"] == pytest.approx(0.35, abs=0.015)
+        assert info["reward_speed"] == pytest.approx(0.35, abs=0.015)
         assert info["success"] == (gone >= 1.0)
     assert info["success"]
 
@@ -69,7 +70,7 @@ def test_the_reward_of_walking_is_what_the_joints_say(make_env):
     env.reset(seed=2)
     for _ in range(60):
         _, reward, _, _, info = env.step(still(env))
-        tracked, terms = env.batch.simulation.avatar.tracked, info["reward_terms"]
+        tracked, terms = env.batch.simulation.avatar.tracked, reward_terms(info)
         head = joints(env)[HEAD, 2] / env.batch.simulation.flesh[0].points.joints[0, HEAD, 2]
         chest = Rotation.from_quat(tracked.rotation.numpy()[0, CHEST].astype(float))
         tilt = np.arccos(min(chest.apply([0.0, 0.0, 1.0])[2], 1.0))
@@ -159,7 +160,7 @@ def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride, speed, yaw)
         passing = stepped(lead, (step + 1) * dt, stride, 0.5 * speed * stride)
         in_turn = tolerance(off, 0.2, 0.4) * (0.5 + 0.5 * passing)
         worth = in_turn * tolerance(np.arccos(min(up, 1.0)), 0.1, 0.6)
-        terms = info["reward_terms"]
+        terms = reward_terms(info)
         assert terms["gait"] / 0.3 == pytest.approx(terms["height"] / 0.1 * worth, abs=2e-3)
         paid.append(worth)
     assert min(paid) < 0.05 and max(paid) > 0.9
@@ -286,7 +287,7 @@ def test_bent_joints_cost_what_they_are_beyond_their_ranges(make_env):
         *_, info = env.step(action)
         local = tracked.local.numpy()[0].astype(float)
         off = beyond({name: Rotation.from_quat(local[joint_index(name)]).as_rotvec() for name in GAIT_POSTURE})
-        assert info["reward_terms"]["posture"] == pytest.approx(-2.0 * np.mean(off**2), rel=1e-3, abs=1e-6)
+        assert info["reward_posture"] == pytest.approx(-2.0 * np.mean(off**2), rel=1e-3, abs=1e-6)
         found.append(np.abs(off).max(1))
     names, most = list(GAIT_POSTURE), np.max(found, axis=0)
     assert all(most[names.index(name)] > 0.05 for name in ("left_hip", "spine1", "right_ankle"))
