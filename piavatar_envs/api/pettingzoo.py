@@ -130,12 +130,15 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
             actions: of every agent in ``agents``, and of no other.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos of the agents that acted.
+            Observations, rewards, terminations, truncations and infos of the agents that acted; empty, and nothing has
+            changed, where all agents have left and there are no actions.
 
         Raises:
             ValueError: an action that is missing, of an agent that does not act, of the wrong shape or not finite;
                 nothing has changed then.
-            gymnasium.error.ResetNeeded: before the first reset, or all agents have left.
+            gymnasium.error.ResetNeeded: before the first reset, or for actions after all agents have left.
+            if isinstance(actions, Mapping) and not actions:
+                return {}, {}, {}, {}, {}
         """
         host = self.host
         host.check_ready("step")

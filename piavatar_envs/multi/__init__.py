@@ -1,16 +1,18 @@
 """PettingZoo environments of the games in :mod:`piavatar_envs.tasks.games` (extra ``multi``).
 
 Every game is built by its name, ``parallel_env("sumo_v0")``. Those of this package also have modules here, in the style
-of PettingZoo: ``from piavatar_envs.multi import sumo_v0``. Importing this package imports none of them.
+of PettingZoo: ``from piavatar_envs.multi import sumo_v0``. Importing this package imports none of them, and registers
+them with PettingZoo from 1.27 on: ``pettingzoo.make("parallel", "piavatar/sumo_v0")``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from piavatar_envs.tasks.games import listed_games, load_game_task
+from piavatar_envs.tasks.games import game_modules, listed_games, load_game_task
 
 if TYPE_CHECKING:
     from piavatar_envs.api.pettingzoo import AECEnv, AvatarParallelEnv
@@ -74,3 +76,17 @@ def parallel_env(name: str, **settings: Any) -> AvatarParallelEnv:
 def env(name: str, **settings: Any) -> AECEnv:
     """Build the game ``name`` for PettingZoo's turn-based API; see :func:`load_game` and :meth:`Game.env`."""
     return load_game(name).env(**settings)
+
+
+def _register() -> None:
+    """Add the games of this package to PettingZoo's registries; does nothing where it has none or is not installed."""
+    try:
+        from pettingzoo import register
+    except ImportError:
+        return
+    for name in game_modules():
+        register("parallel", f"piavatar/{name}", partial(parallel_env, name))
+        register("aec", f"piavatar/{name}", partial(env, name))
+
+
+_register()

@@ -16,14 +16,16 @@ import warnings
 
 import gymnasium
 import numpy as np
+import pettingzoo
 import pettingzoo.test as official
 import pytest
 
-from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.mpm.types import FAILURE_CFL
+from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks.games import game_modules
-
+from tests.api.runs import bytes_of
 from tests.conftest import reward_terms
+
 GAME = "sumo_v0"
 
 #: PettingZoo's complaints that are wanted: these observations have no honest limits.
@@ -61,8 +63,13 @@ def test_listing_is_light_and_a_missing_pettingzoo_is_named():
 import sys
 from piavatar_envs.multi import listed_games
 assert listed_games()
-print([name for name in ("pettingzoo", "warp", "torch", "pyvista") if name in sys.modules])
+print([name for name in ("warp", "torch", "pyvista") if name in sys.modules])
+for name in list(sys.modules):
+    if name.startswith(("pettingzoo", "piavatar_envs")):
+        del sys.modules[name]
 sys.modules["pettingzoo"] = None
+import warnings
+warnings.simplefilter("ignore")  # Gymnasium warns of ids that are registered again
 try:
     from piavatar_envs.multi import sumo_v0
     sumo_v0.parallel_env()
@@ -72,6 +79,14 @@ except ImportError as error:
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     loaded, error = run.stdout.strip().split("\n")
     assert loaded == "[]" and "piavatar-envs[multi]" in error, run.stdout + run.stderr
+
+
+@pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="PettingZoo has had a registry since 1.27")
+def test_pettingzoos_registry_has_the_games(fresh, device):
+    assert {f"piavatar/{name.replace('_v', '-v')}" for name in game_modules()} <= set(pettingzoo.parallel_registry)
+    settings = {"fidelity": "tiny", "device": device, "max_cycles": 2}
+    parallel, aec = (pettingzoo.make(kind, f"piavatar/{GAME}", **settings) for kind in ("parallel", "aec"))
+    assert parallel.metadata["name"] == aec.metadata["name"] == GAME and parallel.host.groups[0].max_steps == 2
 
 
 def test_pettingzoos_tests_pass(fresh, game_name, capsys):
@@ -316,8 +331,10 @@ def test_nothing_goes_before_the_first_reset_or_after_the_end(fresh, play):
     truncations = [row[3] for row in play(game, 5)]
     assert len(truncations) == 2 and all(truncations[1].values()) and not any(truncations[0].values())
     assert game.agents == []
+    before = bytes_of(game.get_state())
+    assert game.step({}) == ({}, {}, {}, {}, {}) and bytes_of(game.get_state()) == before
     with pytest.raises(gymnasium.error.ResetNeeded):
-        game.step({})
+        game.step({"agent_0": game.action_space("agent_0").sample()})
     game.reset()
     assert game.agents == game.possible_agents
 
