@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed
+from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed, limited
 from piavatar_envs.api.pictures import RENDER_MODES, check_render_mode
 from piavatar_envs.config import load_keywords
 from piavatar_envs.envs.task import Task
@@ -43,6 +43,7 @@ class AvatarEnv(SingleView, gym.Env):
         render_mode: str | None = None,
         device: str = "cpu",
         config: Settings = None,
+        max_episode_steps: int | None = None,
         registered: Sequence[str] | None = None,
         **overrides: Any,
     ) -> None:
@@ -53,16 +54,19 @@ class AvatarEnv(SingleView, gym.Env):
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
+            max_episode_steps: control steps until truncation; wins over ``episode_seconds``.
             registered: set by Gymnasium only: the id, and the task that it is registered for.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
             ImportError: ``render_mode="human"`` without the extra ``live``.
-            ValueError: an unknown task or one that the id is not registered for, an unknown render mode or device.
+            ValueError: an unknown task or one that the id is not registered for, an unknown render mode or device, or
+                less than one control step.
         """
         task_class = load_registered(task, registered)
         settings = load_keywords(task_class.Config, config, overrides)
+        settings = limited(settings, "max_episode_steps", max_episode_steps)
         made = {"task": task_class, "render_mode": render_mode, "device": device, "config": settings}
         self._build = partial(AvatarEnv.__init__, **made)
         self.config, self.render_mode, self._over = settings, check_render_mode(render_mode), False

@@ -524,6 +524,16 @@ class HostView:
         self.host.adopt(copied["state"], copied["ready"])
 
     @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's description of how this was made, None without it; its time limit is that of the settings."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        # Gymnasium sets it without a limit, because the limit is part of the environment and not of a wrapper
+        self._spec = spec and replace(spec, max_episode_steps=self.host.groups[0].max_steps)
+
+    @property
     def observation_layout(self) -> ObservationLayout:
         """Name, slice, unit and frame of every term in the flat observation of an agent."""
         return self.host.layout
@@ -616,6 +626,24 @@ class SingleView(HostView):
     def close(self) -> None:
         """Free the renderer's window, and stop the live view; closing twice is fine."""
         self.host.close()
+
+
+def limited(config: Limited, name: str, steps: int | None) -> Limited:
+    """Return a configuration whose episodes last ``steps`` control steps; the same one for None.
+
+    Args:
+        config: the settings.
+        name: of the argument, for the message.
+        steps: control steps until truncation, instead of ``episode_seconds``.
+
+    Raises:
+        ConfigError: more steps than an episode may have.
+        ValueError: it is not a whole number, or less than 1.
+    """
+    if steps is None:
+        return config
+    check_count(name, steps, ", or None for episode_seconds")
+    return replace_settings(config, episode_seconds=steps * config.physics.control_dt)
 
 
 def checked_seed(seed: Any) -> int:

@@ -9,10 +9,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed
+from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed, limited
 from piavatar_envs.api.pictures import RENDER_MODES, check_render_mode
-from piavatar_envs.config import load_keywords, replace
-from piavatar_envs.envs.batch_env import check_count
+from piavatar_envs.config import load_keywords
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
 
@@ -71,10 +70,7 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
             ValueError: an unknown task, render mode or device, or less than one control step.
         """
         task_class = load_task(task)
-        self.config = load_keywords(task_class.Config, config, overrides)
-        if max_cycles is not None:
-            check_count("max_cycles", max_cycles, ", or None for episode_seconds")
-            self.config = replace(self.config, episode_seconds=max_cycles * self.config.physics.control_dt)
+        self.config = limited(load_keywords(task_class.Config, config, overrides), "max_cycles", max_cycles)
         made = {"task": task_class, "render_mode": render_mode, "device": device, "config": self.config, "name": name}
         self._build = partial(AvatarParallelEnv.__init__, **made)
         self.render_mode = check_render_mode(render_mode)
@@ -137,12 +133,12 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
             ValueError: an action that is missing, of an agent that does not act, of the wrong shape or not finite;
                 nothing has changed then.
             gymnasium.error.ResetNeeded: before the first reset, or for actions after all agents have left.
-            if isinstance(actions, Mapping) and not actions:
-                return {}, {}, {}, {}, {}
         """
         host = self.host
         host.check_ready("step")
         if not self.agents:
+            if isinstance(actions, Mapping) and not actions:
+                return {}, {}, {}, {}, {}
             raise gym.error.ResetNeeded("all agents have left; call reset() before step()")
         host.advance(self._checked(actions)[None])
         acted = {name: self._index[name] for name in self.agents}

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from piavatar_envs.api.arrays import Array
-from piavatar_envs.api.host import EpisodeHost, HostView, Settings, failure_names
+from piavatar_envs.api.host import EpisodeHost, HostView, Settings, limited
 from piavatar_envs.api.pictures import BATCH_RENDER_MODES, check_batch_render_mode
 from piavatar_envs.config import EnvConfig, load_keywords
 from piavatar_envs.config.load import setting_keys
@@ -222,6 +222,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         array_api: str = "numpy",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         num_threads: int | None = None,
+        max_episode_steps: int | None = None,
         registered: Sequence[str] | None = None,
         **overrides: Any,
     ) -> None:
@@ -236,6 +237,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
             array_api: kind of arrays: ``"numpy"`` or ``"torch"`` (on ``device``).
             autoreset_mode: an ``AutoresetMode`` or its value, see above.
             num_threads: threads that share the environments on a CPU; one a core if not given. Changes no result.
+            max_episode_steps: control steps until truncation; wins over ``episode_seconds``.
             registered: set by Gymnasium only: the id, and the task that it is registered for.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
@@ -243,11 +245,12 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
             ImportError: ``array_api="torch"`` and torch is not installed.
             ValueError: an unknown task or one that the id is not registered for, an unknown render mode, device, kind
-                of arrays or autoreset mode, or no environments.
+                of arrays or autoreset mode, no environments, or less than one control step.
         """
         self.render_mode, self.autoreset_mode = check_batch_render_mode(render_mode), _autoreset_mode(autoreset_mode)
         task_class = load_registered(task, registered)
-        self.config = load_keywords(task_class.Config, config, overrides)
+        settings = load_keywords(task_class.Config, config, overrides)
+        self.config = limited(settings, "max_episode_steps", max_episode_steps)
         made = {"num_envs": num_envs, "render_mode": render_mode, "device": device, "array_api": array_api}
         made |= {"autoreset_mode": self.autoreset_mode, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarVectorEnv.__init__, task=task_class, **made)
@@ -358,10 +361,10 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         api = host.api
         host.advance(actions)
         ended, observation, ends = host.find_ended(), self._observation(), self._ends()
+        outcome = host.outcome(0)
         infos: dict[str, Any] = {}
         if api.may_hold(ended):
             infos["final_obs"], infos["_final_obs"] = api.rows(observation, ended), api.shown(ended)
-        outcome = host.outcome(0)
             infos |= self._in_vector_format({"final_info": host.status(0) | outcome}, ended)
             host.reset_ended()
             observation = self._observation()

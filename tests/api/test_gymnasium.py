@@ -91,6 +91,23 @@ def test_a_yaml_file_and_keywords_configure(tmp_path, device):
     assert env.metadata["render_fps"] == 50 and AvatarEnv.metadata["render_fps"] == 30
 
 
+def test_the_spec_gives_the_time_limit_and_calls_can_shorten_it(device):
+    settings = {"device": device, "fidelity": "tiny"}
+    env = gymnasium.make(KICK, episode_seconds=0.2, **settings)
+    assert env.spec.max_episode_steps == 6 == gymnasium.make(env.spec).spec.max_episode_steps
+    assert "TimeLimit" not in str(env), "the limit is part of the state"
+    seen = gymnasium.wrappers.TimeAwareObservation(env)
+    assert seen.observation_space.contains(seen.reset(seed=0)[0])
+    single = gymnasium.make(KICK, max_episode_steps=2, **settings)
+    vector = gymnasium.make_vec(KICK, 2, max_episode_steps=2, **settings)
+    assert single.spec.max_episode_steps == vector.spec.max_episode_steps == 2
+    for made in (single, vector):
+        made.reset(seed=0)
+        assert [np.all(made.step(np.zeros(made.action_space.shape, np.float32))[3]) for _ in range(2)] == [False, True]
+    with pytest.raises(ValueError, match="max_episode_steps=0 "):
+        gymnasium.make_vec(KICK, max_episode_steps=0, **settings)
+
+
 def test_a_torch_device_is_accepted(device):
     torch = pytest.importorskip("torch")
     if device == "cpu":
