@@ -170,7 +170,7 @@ assert [i for i in gymnasium.registry if i.startswith("PIAvatar/")], "no id was 
 assert not [name for name in {heavy!r} if name in sys.modules]
 context = sys.modules.get("warp._src.context")
 assert context is None or context.runtime is None
-env = gymnasium.make("PIAvatar/Reach-v0", device="cpu", fidelity="tiny")
+env = gymnasium.make("piavatar_envs:PIAvatar/Reach-v0", device="cpu", fidelity="tiny")
 env.reset(seed=0)
 env.step(env.action_space.sample())
 assert not [name for name in {unused!r} if name in sys.modules]
