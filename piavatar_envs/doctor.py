@@ -15,6 +15,7 @@ from typing import Any
 
 import gymnasium
 
+from piavatar_envs.core.extras import install_command
 from piavatar_envs.core.launch_graph import compiling_threads
 
 PACKAGES = ("piavatar-envs", "warp-lang", "numpy", "scipy", "gymnasium", "pydantic", "stable-baselines3", "torch")
@@ -165,7 +166,7 @@ def show(report: dict[str, Any], *, as_json: bool = False) -> None:
     cache = report["kernel_cache"]
     table.add_row("kernel cache", f"{cache['path']}: {cache['modules']} modules, {cache['bytes'] / 2**20:.1f} MiB")
     for name, missing in report["extras"].items():
-        remedy = f'pip install "piavatar-envs[{name}]"'
+        remedy = install_command(name)
         table.add_row(f"extra {name}", f"missing {', '.join(missing)}: {remedy}" if missing else "present")
     size = report["default_env"]
     shape = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps a step"

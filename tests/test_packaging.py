@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import types
 import zipfile
 from pathlib import Path
 
@@ -78,6 +79,20 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = subprocess.run([*pip, "--ignore-installed", str(wheel)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return python
+
+
+def test_hints_install_extras_from_where_the_package_is(monkeypatch, tmp_path):
+    """The package is on no index, so that its name alone installs nothing."""
+    from piavatar_envs.core import extras
+
+    assert extras.install_command("live") == f'pip install -e "{ROOT}[live]"'
+    origin = {"url": "https://host/name.git", "vcs_info": {"vcs": "git", "commit_id": "0"}}
+    found = types.SimpleNamespace(read_text=lambda name: json.dumps(origin))
+    monkeypatch.setattr(extras.importlib.metadata, "distribution", lambda name: found)
+    assert extras.install_command("live") == 'pip install "piavatar-envs[live] @ git+https://host/name.git"'
+    own = Path(extras.__file__)
+    texts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "piavatar_envs").rglob("*.py") if path != own}
+    assert not [path for path, text in texts.items() if "pip install" in text]
 
 
 def test_the_wheel_holds_the_package_and_its_data(wheel):

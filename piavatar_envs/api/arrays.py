@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from piavatar_envs.core.extras import missing
 from piavatar_envs.envs.actions import check_actions
 from piavatar_envs.envs.observations import ObservationLayout
 
@@ -225,8 +226,7 @@ class TorchArrays:
         try:
             import torch
         except ImportError as error:
-            message = "array_api='torch' needs torch; install it with: pip install 'piavatar-envs[train]'"
-            raise ImportError(message) from error
+            raise missing("array_api='torch'", "torch", "train") from error
         self._torch, self._device = torch, wp.get_device(device)
         self.device = torch.device(wp.device_to_torch(self._device))
         if self._device.is_cuda and not torch.cuda.is_available():

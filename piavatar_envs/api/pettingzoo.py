@@ -12,6 +12,7 @@ import numpy as np
 from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed, limited
 from piavatar_envs.api.pictures import RENDER_MODES, check_render_mode
 from piavatar_envs.config import load_keywords
+from piavatar_envs.core.extras import missing
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
 
@@ -19,7 +20,7 @@ try:
     from pettingzoo import AECEnv, ParallelEnv
     from pettingzoo.utils.conversions import parallel_to_aec
 except ImportError as error:
-    raise ImportError("several agents need PettingZoo; install it with: pip install 'piavatar-envs[multi]'") from error
+    raise missing("a game of several agents", "PettingZoo", "multi") from error
 
 # the modules in multi/ import PettingZoo from here, so that each reports the extra to install
 __all__ = ["AECEnv", "AvatarParallelEnv", "parallel_to_aec"]

@@ -15,6 +15,7 @@ from typing import Any
 
 from piavatar_envs.api.host import EpisodeHost, HostView, Settings
 from piavatar_envs.config import ConfigError, EnvConfig, load_keywords
+from piavatar_envs.core.extras import missing
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
 
@@ -23,7 +24,7 @@ try:
     from rsl_rl.env import VecEnv
     from tensordict import TensorDict
 except ImportError as error:
-    raise ImportError("this view needs rsl_rl; install it with: pip install 'piavatar-envs[rsl]'") from error
+    raise missing("this view", "rsl_rl", "rsl") from error
 
 
 class AvatarRslEnv(HostView, VecEnv):

@@ -10,13 +10,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from piavatar_envs.api.vector_env import AvatarVectorEnv, single_infos
+from piavatar_envs.core.extras import missing
 from piavatar_envs.envs.task import Task
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
-    message = "Stable-Baselines3 is not installed; install it with: pip install 'piavatar-envs[train]'"
-    raise ImportError(message) from error
+    raise missing("this view", "Stable-Baselines3", "train") from error
 
 #: Indices of environments as Stable-Baselines3 gives them; None for all.
 Indices = int | Iterable[int] | None

@@ -23,8 +23,14 @@ import gymnasium as gym
 from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.host import EpisodeHost, HostView, Settings, Transition
 from piavatar_envs.config import load_keywords
+from piavatar_envs.core.extras import missing
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
+
+try:
+    import torch
+except ImportError as error:
+    raise missing("this view", "torch", "skrl") from error
 
 
 class AvatarSkrlEnv(HostView):
@@ -282,8 +288,6 @@ def _joint(rows: list[Array], num_envs: int, size: int) -> Array:
     Raises:
         ValueError: the actions of an agent have a wrong shape.
     """
-    import torch
-
     for row in rows:
         if tuple(row.shape) != (num_envs, size):
             raise ValueError(f"an agent's actions have shape {tuple(row.shape)}, expected {(num_envs, size)}")

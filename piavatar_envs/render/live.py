@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
+from piavatar_envs.core.extras import missing
 from piavatar_envs.render import ground
 from piavatar_envs.render.coloring import bands_of, strain_table
 from piavatar_envs.render.geometry import drawable
@@ -47,9 +48,7 @@ def import_viser() -> ModuleType:
     try:
         import viser
     except ImportError as error:
-        raise ImportError('the live view needs viser, which is not installed; pip install "piavatar-envs[live]"') from (
-            error
-        )
+        raise missing("the live view", "viser", "live") from error
     return viser
 
 

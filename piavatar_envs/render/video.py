@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from piavatar_envs.core.extras import missing
+
 SUFFIXES = (".mp4", ".gif")
 _GIF_COLORS, _GIF_SAMPLES = 128, 12
 _GIF_FASTEST = 50.0  # frames per second; viewers slow down what is quicker
@@ -60,9 +62,7 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise ImportError(
-            'MP4 video needs imageio-ffmpeg, which is not installed; pip install "piavatar-envs[render]"'
-        ) from error
+        raise missing("MP4 video", "imageio-ffmpeg", "render") from error
     writer, shape, count = None, None, 0
     try:
         for count, frame in enumerate(frames, start=1):
@@ -88,9 +88,7 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError(
-            'GIF video needs Pillow, which is not installed; pip install "piavatar-envs[render]"'
-        ) from error
+        raise missing("GIF video", "Pillow", "render") from error
     shape, images = None, []
     for count, frame in enumerate(frames, start=1):
         frame = _checked(frame, shape, count)

@@ -6,6 +6,7 @@ from types import ModuleType
 
 import numpy as np
 
+from piavatar_envs.core.extras import missing
 from piavatar_envs.render import ground
 from piavatar_envs.render.backend import Shot
 from piavatar_envs.render.display import off_screen_window
@@ -26,9 +27,7 @@ def import_pyvista() -> ModuleType:
     try:
         import pyvista
     except ImportError as error:
-        raise ImportError(
-            'rendering needs pyvista, which is not installed; pip install "piavatar-envs[render]"'
-        ) from error
+        raise missing("rendering", "pyvista", "render") from error
     return pyvista
 
 

@@ -17,6 +17,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from piavatar_envs.avatar.body.sampling import LINK_LENGTH, ClosedSurface
+from piavatar_envs.core.extras import missing
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS, solid_distance
 
 wp.set_module_options({"enable_backward": False})
@@ -160,8 +161,8 @@ def _load(path: Path):
     """Load a file as a ``trimesh.Trimesh`` that is closed and faces outward."""
     try:
         import trimesh
-    except ImportError:
-        raise ImportError("a prop from a mesh needs trimesh: pip install piavatar-envs[props]") from None
+    except ImportError as error:
+        raise missing("a prop from a mesh", "trimesh", "props") from error
     if path.suffix.lower() not in MESH_FORMATS:
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_FORMATS)}")
     if not path.is_file():

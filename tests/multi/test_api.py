@@ -13,6 +13,7 @@ import subprocess
 import sys
 import types
 import warnings
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -78,7 +79,7 @@ except ImportError as error:
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     loaded, error = run.stdout.strip().split("\n")
-    assert loaded == "[]" and "piavatar-envs[multi]" in error, run.stdout + run.stderr
+    assert loaded == "[]" and f'pip install -e "{Path(__file__).parents[2]}[multi]"' in error, run.stdout + run.stderr
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="PettingZoo has had a registry since 1.27")

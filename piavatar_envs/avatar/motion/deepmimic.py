@@ -26,6 +26,7 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights, padded
 from piavatar_envs.avatar.motion.motion import Motion, ease, hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, leg_length, retarget, root_path
+from piavatar_envs.core.extras import missing
 
 NUM_CHANNELS = 44
 LEG_LENGTH = 0.8314  # [m] hip to knee to ankle of DeepMimic's humanoid (0.4215 + 0.4099)
@@ -77,10 +78,7 @@ def load_installed(name: str, rest_joints: np.ndarray) -> Motion:
     """
     folder = clip_folder()
     if folder is None:
-        raise ImportError(
-            f"the DeepMimic clip {name!r} is read from an installed pybullet, which is missing: "
-            "pip install 'piavatar-envs[motions]' (wheels exist for Python 3.10 and 3.11)"
-        )
+        raise missing(f"the DeepMimic clip {name!r}", "pybullet (which has wheels for Python 3.10 and 3.11)", "motions")
     if name not in list_clips():
         raise ValueError(f"no DeepMimic clip {name!r}; installed are {', '.join(list_clips())}")
     return load_file(folder / f"{_PREFIX}{name}{_SUFFIX}", rest_joints)
