@@ -107,7 +107,7 @@ class MadeUp(Task):
 
 def test_gaps_in_the_documentation_are_found():
     layout = ObservationLayout([ObservationTerm("height", 1, "m", "world", "of the pelvis")])
-    facts = Facts(MadeUp(EnvConfig()), layout, (), {"success": False}, {"distance": 1.0, "cost": 0.0})
+    facts = Facts(MadeUp(EnvConfig()), layout, (), {"distance": 1.0, "cost": 0.0})
 
     def found(facts=facts, **attributes):
         return "\n".join(gaps(Entry("made_up", "MadeUp-v0", type("MadeUp", (MadeUp,), attributes)), facts))
