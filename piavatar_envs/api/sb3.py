@@ -128,6 +128,10 @@ class SB3VecEnv(VecEnv):
         """
         self.vector.assist_root(share)
 
+    def apply_force(self, *args: Any, **kwargs: Any) -> None:
+        """Let a force act on a bone or a prop; see :meth:`piavatar_envs.api.host.HostView.apply_force`."""
+        self.vector.apply_force(*args, **kwargs)
+
     def close(self) -> None:
         """Free the renderers and end the threads."""
         self.vector.close()

@@ -51,7 +51,7 @@ from piavatar_envs.core.cuda_intrinsics import (
 )
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import make_struct
-from piavatar_envs.mpm.types import FAILURE_FORCE, Model, Particles, State, row
+from piavatar_envs.mpm.types import DECOUPLING, FAILURE_FORCE, Model, Particles, State, row
 from piavatar_envs.sim.props import PropSet
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -287,7 +287,10 @@ class Forces:
             return
         model, threads, common = self.model, self._threads, [self.slots, self._targets]
         n, chunks = model.num_envs, self._targets.of_chunk.shape[0]
-        inputs = [*common, self._fields.held, model.particles, state.x, state.u, state.vk, state.failure, threads]
+        # a model of one velocity has the prescribed part in it
+        prescribed = 0.0 if model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"]) else 1.0
+        moving = [state.x, state.u, state.vk, prescribed]
+        inputs = [*common, self._fields.held, model.particles, *moving, state.failure, threads]
         graph.launch(sum_targets, (n, chunks, threads), inputs, [self._fields.moments], block_dim=threads)
         inputs = [*common, model.step.dt, step, state.x, state.failure]
         graph.launch(solve_fields, (n, SLOTS), inputs, [self._fields])
@@ -436,12 +439,13 @@ def sum_targets(
     x: wp.array2d(dtype=wp.vec3),
     u: wp.array2d(dtype=wp.vec3),
     vk: wp.array2d(dtype=wp.vec3),
+    prescribed: float,
     failure: wp.array(dtype=int),
     threads: int,
     # out
     moments: wp.array2d(dtype=vec16),
 ):
-    """Sum the moments of the chunks of targets that forces act on, with the total velocity.
+    """Sum the moments of the chunks of targets that forces act on, with the total velocity ``u + prescribed vk``.
 
     Over ``(num_envs, chunks, threads)``, a warp a chunk on a GPU.
     """
@@ -460,7 +464,7 @@ def sum_targets(
     total = vec16()
     for n in range(targets.entry_start[c] + thread, targets.entry_start[c + 1], threads):
         p = targets.entry[n]
-        total += moments_of(targets.weight[n] * particles.mass[r, p], x[e, p] - origin, u[e, p] + vk[e, p])
+        total += moments_of(targets.weight[n] * particles.mass[r, p], x[e, p] - origin, u[e, p] + prescribed * vk[e, p])
     total = sum_threads16(total, threads)
     if thread == 0:
         moments[e, c] = total

@@ -107,6 +107,18 @@ def test_single_environments_are_pushed_by_name(make_vec):
     assert remaining["call"] == remaining["envs"] == [[4, 0], [4, 1], [4, 0]]
 
 
+def test_stable_baselines_environments_are_pushed(device):
+    pytest.importorskip("stable_baselines3")
+    from piavatar_envs.api.sb3 import SB3VecEnv
+
+    vector = SB3VecEnv(KICK, 2, device=device, fidelity="tiny")
+    vector.reset()
+    vector.apply_force("head", PUSH, steps=4, envs=[1])
+    assert vector.env_method("apply_force", "ball", PUSH, steps=2, indices=[0, 1]) == [None, None]
+    assert vector.vector.get_state()["forces.remaining"][:, :2].tolist() == [[2, 0], [4, 2]]
+    vector.close()
+
+
 def test_tensors_push_as_arrays_do(make_vec, same):
     torch = pytest.importorskip("torch")
     found = {}

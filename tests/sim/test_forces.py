@@ -14,7 +14,12 @@ from piavatar_envs.sim.forces import SLOTS
 STAND = "PIAvatar/Stand-v0"
 EMPTY = {"gravity": 0.0, "scene": {"ground": False, "walls": False}}
 BALL = {"name": "ball", "mass": 1.5, "position": [0.0, -1.2, 1.3]}
-FREE = {"pose": {"control": "pose", "root": "free"}, "pd": {"control": "pd"}, "torque": {"control": "torque"}}
+FREE = {
+    "pose": {"control": "pose", "root": "free"},
+    "one velocity": {"control": "pose", "root": "free", "decoupling": "paper"},
+    "pd": {"control": "pd"},
+    "torque": {"control": "torque"},
+}
 #: A substep a control step, in which the arm of a force is known exactly.
 FINE = 1.0 / 600.0
 
