@@ -233,15 +233,21 @@ def _modulus(regions: tuple[RegionConfig, ...]) -> float | None:
     return regions[0].young_modulus if regions else 1e5
 
 
+def drops() -> list[Act]:
+    """Return acts of a body that is set down from 0.3 m within 0.25 s: firm flesh, and soft flesh that lags."""
+    down, up = {"root": (0.0, 0.0, 0.0)}, {"root": (0.0, 0.0, 0.3)}
+    return _landings("drop", keyed((0.0, down), (0.6, up), (0.75, up), (1.0, down)), 1.8, "scripted drop of 0.3 m")
+
+
 def jumps() -> list[Act]:
-    """Return acts of a jump: with flesh that keeps to its bones, and with soft flesh that lags."""
-    if JUMP_CLIP in list_motions():
-        motion = load_motion(JUMP_CLIP)
-        script, seconds, clip = played(motion.translated([*-motion.root_position[0, :2], 0.0])), 1.75, JUMP_CLIP
-    else:
-        down, up = {"root": (0.0, 0.0, 0.0)}, {"root": (0.0, 0.0, 0.3)}
-        script = keyed((0.0, down), (0.6, up), (0.75, up), (1.0, down))
-        seconds, clip = 1.8, "scripted drop of 0.3 m"
+    """Return the same acts in the jump of a motion clip; none where the clip is not installed."""
+    if JUMP_CLIP not in list_motions():
+        return []
+    motion = load_motion(JUMP_CLIP)
+    return _landings("jump", played(motion.translated([*-motion.root_position[0, :2], 0.0])), 1.75, JUMP_CLIP)
+
+
+def _landings(title: str, script: Script, seconds: float, clip: str) -> list[Act]:
     found = []
     for name, soft, young in (
         ("firm flesh", 0.0, None),
@@ -250,7 +256,7 @@ def jumps() -> list[Act]:
     ):
         found.append(
             Act(
-                f"jump, {name}",
+                f"{title}, {name}",
                 seconds=seconds,
                 scene=SceneConfig(avatars=(AvatarConfig(shape={"parameters": {"belly": 1.0, "weight": 0.7}}),)),
                 script=script,

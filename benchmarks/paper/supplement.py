@@ -59,6 +59,7 @@ def rows(fidelity: str = "coarse", device: str = "cpu", quick: bool = False) -> 
 def studies(folder: Path) -> dict[str, tuple[list[Act], Callable[[Course], Row], Callable[[list[Row]], Verdict]]]:
     """Return acts, measure and judge of every study; mesh files are written into ``folder``."""
     torus, can = write_meshes(folder)
+    jumps = acts.jumps()
     return {
         "ball mass": (acts.kicks(), measures.kick, judge_kicks),
         "ball stiffness": (acts.throws(), measures.throw, judge_throws),
@@ -68,8 +69,8 @@ def studies(folder: Path) -> dict[str, tuple[list[Act], Callable[[Course], Row],
         "limb fields": (acts.crossed_legs(), measures.legs, judge_legs),
         "pillow": (acts.pillows(), measures.pillow, judge_pillows),
         "regions": (acts.cans(can), measures.can, judge_cans),
-        "jiggle": (acts.jumps(), measures.jump, judge_jumps),
-    }
+        "jiggle": (acts.drops(), measures.jump, judge_jumps),
+    } | ({"jiggle in a jump": (jumps, measures.jump, judge_jumps)} if jumps else {})
 
 
 def write_meshes(folder: Path) -> tuple[Path, Path]:

@@ -56,12 +56,12 @@ def figures(folder: Path) -> dict[str, Figure]:
     """Return all figures by file name; mesh files are written into ``folder``."""
     torus, can = write_meshes(folder)
     kicks, throws, hits = acts.kicks(), acts.throws(), acts.head_hits()
-    dents, legs, pillows, cans, jumps = (
+    dents, legs, pillows, cans, drops = (
         acts.belly_dents(),
         acts.crossed_legs(),
         acts.pillows(),
         acts.cans(can),
-        acts.jumps(),
+        acts.drops(),
     )
     return {
         "kick_mass": Figure(kicks[1:], ("0.5 kg", "1.5 kg", "8 kg"), 1.1, (0, 2)),
@@ -72,7 +72,7 @@ def figures(folder: Path) -> dict[str, Figure]:
         "limb_fields": Figure(legs[:2], ("limb fields", "one field")),
         "pillow": Figure([pillows[0], pillows[2], pillows[3]], ("1 kPa", "5 kPa", "100 kPa")),
         "regions": Figure(cans, ("head", "head, hair", "belly", "belly, garment", "ankle", "ankle, stiff")),
-        "jiggle": Figure([jumps[0], jumps[2]], ("firm", "soft_tissue 0.8, 5 kPa")),
+        "jiggle": Figure([drops[0], drops[2]], ("firm", "soft_tissue 0.8, 5 kPa")),
     }
 
 
