@@ -79,6 +79,32 @@ def test_the_time_step_follows_the_viscosity(simulate):
         simulate(retardation=-1.0)
 
 
+def kept_by_transfer(k, places):
+    """Return the share of a wave ``k`` [1/cell] that P2G and G2P keep; ``places`` of particles in a cell, in cells."""
+
+    def weight(d):
+        return np.where(abs(d) < 0.5, 0.75 - d**2, np.where(abs(d) < 1.5, 0.5 * (1.5 - abs(d)) ** 2, 0.0))
+
+    # the affine part after a transfer is that of the node's wave, which the velocity is, too
+    way = np.add.outer(np.arange(-3, 4), places)
+    both = weight(way) * np.exp(1j * k * way), weight(way) * way * np.exp(1j * k * way)
+    return float((abs(both[0].sum(0)) ** 2 + 4.0 * abs(both[1].sum(0)) ** 2).sum() / weight(way).sum())
+
+
+@pytest.mark.parametrize("cells", [4, 8])
+def test_transfers_damp_short_waves_alone(simulate, cells):
+    # Without stress, each substep damps a wave of ``cells`` grid spacings as the splines say, by less than k^4 / 40.
+    dx, substeps, k = 0.05, 8, 2.0 * np.pi / cells
+    sim = simulate((-0.6, -0.3, -0.3), (0.6, 0.3, 0.3), decoupling="no_stress", control_dt=1e-4, num_substeps=substeps)
+    wave = np.sin(k * sim.rest[:, 0] / dx)
+    sim.set(u=wave[:, None] * [0.0, 1.0, 0.0]).run()  # the affine part settles within a transfer
+    inside = (np.abs(sim.rest) < [0.2, 0.1, 0.1]).all(1)
+    before = sim.get("u")[inside, 1] @ wave[inside]
+    kept = (sim.run(2).get("u")[inside, 1] @ wave[inside] / before) ** (0.5 / substeps)
+    assert kept == pytest.approx(kept_by_transfer(k, (0.25, 0.75)), abs=0.01 * (1.0 - kept))
+    assert 1.0 - k**4 / 40.0 < kept < 1.0
+
+
 def test_settings_give_a_retardation_time():
     # A damping ratio is stated for one frequency, w t / 2, and adds to a viscosity.
     ratio = np.pi * DAMPING_FREQUENCY * retardation_time(0.0, 0.2, 4e4)
