@@ -15,7 +15,7 @@ from piavatar_envs.config.schema import LEAST_DENSITY, MOST_DENSITY
 from piavatar_envs.core.arrays import store_matrix
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.materials import lame_parameters, retardation_time
-from piavatar_envs.mpm.measured_strain import make_neighbours, record_correction
+from piavatar_envs.mpm.measured_strain import MeasuredStrain
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Kinematic, Model, Particles, State, row
 from piavatar_envs.sim import prop_geometry as geometry
@@ -191,7 +191,9 @@ class PropSet:
         self.points, self.model, self.fields_of = tuple(points), model, tuple(fields_of)
         n, device = model.num_envs, model.device
         self.props = [upload_prop(own, begin, device) for own, begin in zip(points, first, strict=True)]
-        self.neighbours = [make_neighbours(own.links, len(own), device) for own in points]
+        self.strain = [
+            MeasuredStrain(model, own.links, begin, len(own)) for own, begin in zip(points, first, strict=True)
+        ]
         self.matter = [nominal_matter(own) for own in matter]
         self.volume = np.array([float(own.volume.sum()) for own in points])
         self.mass = np.array([m.density * own.volume.sum() for m, own in zip(self.matter, points, strict=True)])
@@ -242,9 +244,9 @@ class PropSet:
         )
 
     def record_strain(self, graph: LaunchGraph, state: State) -> None:
-        """Record the launches that end a control step: the strain of each prop approaches the measured one."""
-        for prop, neighbours in zip(self.props, self.neighbours, strict=True):
-            record_correction(graph, self.model, state, neighbours, prop.first, prop.rest, prop.rest)
+        """Record the launches that end a control step: correct the strain of each prop against its rest shape."""
+        for prop, strain in zip(self.props, self.strain, strict=True):
+            strain.record(graph, state, prop.rest, prop.rest)
 
     def record_tracking(self, graph: LaunchGraph, state: State) -> None:
         """Record the launches that fit a rigid motion to the particles of each prop."""

@@ -47,8 +47,8 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
 6. *Fit*, after a new mass matrix: the pose is moved by a share of ``M^-1 J^T m (x - LBS)``, with the particles'
    displacements from their skinned places ``LBS`` at the beginning of the substep.
 
-After a control step, ``F`` approaches the strain measured against the skinned places
-(:mod:`~piavatar_envs.mpm.measured_strain`). Then
+After a control step, ``F`` approaches the strain measured against the skinned places, and hourglass modes of the
+particles are taken back (:mod:`~piavatar_envs.mpm.measured_strain`). Then
 :func:`~piavatar_envs.avatar.torque_control.flesh_coupling.put_in_place` moves firm particles,
 those of bones, to their skinned places, but not beyond boundaries. It changes no velocity; the angular
 momentum ``m s x v`` of displacement ``s`` is compensated in the affine velocity ``C``. ``slip`` stores the
@@ -100,7 +100,7 @@ from piavatar_envs.avatar.types import Body, JointState, Pose, allocate
 from piavatar_envs.core.cuda_intrinsics import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import make_struct
-from piavatar_envs.mpm.measured_strain import make_neighbours, record_correction
+from piavatar_envs.mpm.measured_strain import MeasuredStrain
 from piavatar_envs.mpm.types import Model, Scratch, State
 
 
@@ -183,7 +183,7 @@ class ArticulatedBody:
         self._scratch = wp.zeros(words, dtype=float, device=device)
         self.impulse = wp.zeros((n, NUM_DOF), dtype=float, device=device)
         self.support = allocate(Support, n, device)
-        self._neighbours = None if links is None else make_neighbours(links, points.num_points, device)
+        self._strain = None if links is None else MeasuredStrain(model, links, body.first, points.num_points)
         self._places = wp.zeros((n, 0 if links is None else points.num_points), dtype=wp.vec3, device=device)
         self._workspace = self._allocate()
         without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
@@ -327,11 +327,10 @@ class ArticulatedBody:
         Grid blocks are not activated for the new positions; the next control step activates all.
         """
         model, w = self.model, self._workspace
-        if self._neighbours is not None:
+        if self._strain is not None:
             dim = (model.num_envs, self.body.count)
             graph.launch(find_places, dim, [self.body, w.place, state.failure], [self._places])
-            rest = self.body.rest, self._places
-            record_correction(graph, model, state, self._neighbours, self.body.first, *rest)
+            self._strain.record(graph, state, self.body.rest, self._places)
         if self.firm.size == 0:
             return
         inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, w.pose.position, state.u, state.vk]

@@ -171,6 +171,9 @@ class TorqueController:
             commands; None for a start at rest. Set it before a reset is recorded.
     """
 
+    #: The end of a control step takes back hourglass modes, and moves firm particles.
+    moves_particles = True
+
     def __init__(self, avatar: Avatar, points: BodyPoints, parameters: TorqueControl) -> None:
         """Connect the joints to the goals of the avatar.
 
@@ -214,11 +217,6 @@ class TorqueController:
     def state(self) -> JointState:
         """Return the joints' state, which checkpoints store together with :attr:`assist`."""
         return self.joints.state
-
-    @property
-    def moves_particles(self) -> bool:
-        """Return whether the end of a control step moves firm particles."""
-        return self.joints.firm.size > 0
 
     def release(self, joints: list[int]) -> None:
         """Remove the springs of ``joints``, by index, so that torques alone move them."""

@@ -42,6 +42,7 @@ from piavatar_envs.core.cuda_intrinsics import (
     warp_of_block,
 )
 from piavatar_envs.mpm.colliders import signed_distance
+from piavatar_envs.mpm.measured_strain import affine_after_move
 from piavatar_envs.mpm.types import Boundaries, Grid, Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -222,8 +223,7 @@ def put_in_place(
     """Move the ``firm`` particles to their skinned places, but not beyond boundaries; over ``num_envs * firm.size``.
 
     No particle's velocity ``v`` changes. The angular momentum ``m s x v`` of displacement ``s`` is compensated in the
-    affine velocity ``C``, of which the grid receives ``m (dx^2/4) eps C`` (Jiang et al. 2015, quadratic weights).
-    ``slip`` stores the displacement, in the frame of the rest pose.
+    affine velocity. ``slip`` stores the displacement, in the frame of the rest pose.
     """
     own = environment_of(wp.tid(), firm.shape[0])
     e = own[0]
@@ -233,8 +233,7 @@ def put_in_place(
     q = body.first + p
     at = keep_outside(boundaries, e, vector_at(position, e, 0) + skinned_place(body, place, e, p))
     way = at - vector_at(x, e, q)
-    spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, vector_at(u, e, q) + vector_at(vk, e, q))
-    affine = matrix_at(C, e, q) - wp.skew(spin)
+    affine = affine_after_move(grid, matrix_at(C, e, q), way, vector_at(u, e, q) + vector_at(vk, e, q))
     slipped = vector_at(slip, e, p) + blend_back(place, e, body.skin, p, way)
     set_vector(x, e, q, at)  # stores after all loads
     set_vector(slip, e, p, slipped)
