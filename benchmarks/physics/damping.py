@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from benchmarks.physics.resolution import strike
 
 BAR = (0.1, 0.1, 0.3)  # half extents [m]
 MODULUS, DENSITY = 1.0e5, 1000.0  # of the bar [Pa], [kg/m^3]
+DAMPED, DAMPED_AT = 0.15, 25.0  # damping ratio of viscous matter, and the frequency for which it is stated [Hz]
 PERIODS, SAMPLES = 6, 40  # of its first mode, and control steps in each
 AMPLITUDE = 0.05  # of its velocity [m/s]
 STIFF = 1.0e7  # modulus of the far prop [Pa]
@@ -32,12 +34,12 @@ def bar_mode() -> float:
     return float(np.sqrt(MODULUS / DENSITY)) / (4.0 * BAR[2])
 
 
-def ring(options: Options, finer: int = 1) -> Ring:
-    """Excite the first mode of a free bar and follow it; ``finer`` multiplies the substeps."""
+def ring(options: Options, finer: int = 1, **matter: Any) -> Ring:
+    """Excite the first mode of a free bar of this ``matter`` and follow it; ``finer`` multiplies the substeps."""
     theory = bar_mode()
     dt = 1.0 / (theory * SAMPLES)
     prop = {"name": "bar", "shape": "box", "size": list(BAR), "density": DENSITY, "young_modulus": MODULUS}
-    prop |= {"poisson_ratio": 0.0, "position": [-1.0, -1.0, 1.2]}
+    prop |= {"poisson_ratio": 0.0, "position": [-1.0, -1.0, 1.2]} | matter
     settings = {"control_dt": dt, **empty(prop)}
     probe = Probe.under(options, "pose", **settings)
     if finer > 1:
@@ -69,6 +71,10 @@ def ringing(options: Options) -> Iterator[Quantity]:
     yield at_most("damping ratio", once.damping_ratio, 0.01, theory=0.0)
     change = abs(finer.damping_ratio - once.damping_ratio)
     yield at_most("change of the damping ratio with 4 times the substeps", change, 0.005, theory=0.0)
+    viscous = ring(options, damping_ratio=DAMPED)
+    theory = DAMPED * bar_mode() / DAMPED_AT
+    name = f"damping ratio of matter with {DAMPED:g} at {DAMPED_AT:g} Hz, less the grid's"
+    yield equal(name, viscous.damping_ratio - once.damping_ratio, theory, 0.05 * theory)
 
 
 @check("time_step", "ball of 1.5 kg at 4 m/s rebounds from the chest (pose)")
