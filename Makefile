@@ -8,12 +8,13 @@ EXTRAS := render,live,train,motions,multi,props,skrl,rsl,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test lint format docs clean
+.PHONY: help install demo test test-lowest lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
 	@echo "make demo      train PPO on PIAvatar/Reach-v0 on the CPU (ten minutes at most), leaves runs/demo/"
 	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
+	@echo "make test-lowest   test the views under the oldest supported Gymnasium and PettingZoo"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too; CHECK=1 compares only)"
 	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
@@ -47,6 +48,13 @@ ifeq ($(DEVICE):$(PYTEST_ARGS),cpu:)
 	$(MAKE) docs CHECK=1
 	$(PYTEST) --device gpu_on_cpu $(OF_A_GPU)
 endif
+
+# The views under the oldest supported versions of their interfaces, which take precedence from a folder of their own.
+LOWEST := $(VENV)/lowest
+test-lowest: install
+	test -d $(LOWEST) || $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(LOWEST) gymnasium==1.1.1 pettingzoo==1.24.3
+	PYTHONPATH=$(LOWEST) $(PYTEST) tests/api/test_gymnasium.py tests/api/test_vector.py tests/multi/test_api.py \
+	  -k "not picture and not camera and (test_gymnasium or Kick or pettingzoo or wrappers or first_reset)"
 
 lint: install
 	$(BIN)/ruff check .
