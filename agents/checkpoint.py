@@ -11,7 +11,6 @@ A training whose parameters or outputs are no longer finite ends in an error bef
 
 from __future__ import annotations
 
-import pickle
 import random
 import warnings
 import zipfile
@@ -25,6 +24,7 @@ from pydantic import BaseModel
 
 from agents.files import CHECKPOINT, POLICIES, RESULTS, git_commit, hold, write_atomically
 from piavatar_envs.config import ConfigError
+from piavatar_envs.core.reading import UNREADABLE, first_line
 from piavatar_envs.doctor import package_version
 
 #: Of the file's content; rises with every change.
@@ -125,28 +125,16 @@ class Checkpoint:
             )
 
 
-#: Errors of reading a file that is damaged or not a checkpoint.
-UNREADABLE = (
-    pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError, OSError, ValueError, KeyError,
-    zipfile.BadZipFile,
-)  # fmt: skip
-
-
 def load_weights(path: Path, device: str) -> Any:
     """Load a file of ``torch.save`` without running code that it might contain, and verify its checksums.
 
     Raises:
-        Exception: of :data:`UNREADABLE`, the file is damaged or another's.
+        Exception: of :data:`piavatar_envs.core.reading.UNREADABLE`, the file is damaged or another's.
     """
     with zipfile.ZipFile(path) as archive:
         if (damaged := archive.testzip()) is not None:
             raise ValueError(f"{damaged} is damaged")
     return torch.load(path, map_location=device, weights_only=True)
-
-
-def first_line(error: Exception) -> str:
-    """Return the first line of an error's message, or the error's name if the message is empty."""
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def policy_mismatch(path: Path, seen: int, action_size: int, error: Exception) -> ConfigError:

@@ -20,6 +20,7 @@ from pydantic import BaseModel
 from piavatar_envs import doctor
 from piavatar_envs.config import ConfigError, dump_yaml
 from piavatar_envs.core.launch_graph import available_cores
+from piavatar_envs.core.reading import reading
 
 try:
     import fcntl
@@ -130,10 +131,8 @@ def read_json(path: Path) -> Any:
         OSError: there is no such file.
         ValueError: it is no JSON.
     """
-    try:
+    with reading(path, "JSON"):
         return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is no JSON ({error}); write it anew") from None
 
 
 def check_figures(path: Path, script: str) -> None:

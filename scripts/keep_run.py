@@ -18,9 +18,10 @@ import torch
 import tyro
 import yaml
 
-from agents.checkpoint import UNREADABLE, differences
+from agents.checkpoint import differences
 from agents.files import read_json
 from agents.sb3.policy import CRITICS, PARAMETERS
+from piavatar_envs.core.reading import UNREADABLE
 
 #: Files of every run, and files of the one whose policy is kept.
 NEEDED, SCORES, POLICY = ("config.yaml", "results.json"), ("results.json", "evaluation.json"), "policy.pt"

@@ -13,12 +13,13 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from agents.batch_training import BatchTraining, load_batched
-from agents.checkpoint import UNREADABLE, load_weights, policy_mismatch
+from agents.checkpoint import load_weights, policy_mismatch
 from agents.config import Widths
 from agents.evaluate import Agent
 from agents.rsl_rl.curriculum import AssistSchedule
 from agents.sb3.workers import components
 from piavatar_envs.config import FROZEN, FrozenDict
+from piavatar_envs.core.reading import UNREADABLE
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
 

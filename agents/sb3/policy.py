@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from agents.evaluate import Agent
 from agents.sb3 import ppo
 from agents.sb3.config import TrainingConfig
 from agents.sb3.workers import components
+from piavatar_envs.core.reading import UNREADABLE
 from piavatar_envs.envs.observations import ObservationLayout
 
 #: Name of the policy's parameters within ``policy.zip``.
@@ -53,7 +53,7 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
         unlike = [name for name in loaded.missing_keys if not name.startswith(CRITICS)] + loaded.unexpected_keys
         if unlike:
             raise KeyError(f"missing or unknown parameters: {', '.join(unlike)}")
-    except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
+    except UNREADABLE as error:
         raise policy_mismatch(path, len(components(layout, config.observe)), action_size, error) from None
     return policy_agent(policy.eval())
 

@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 import yaml
@@ -27,10 +27,13 @@ from piavatar_envs.config.errors import (
     shown,
     variants_of,
 )
+from piavatar_envs.core.reading import UNREADABLE
 
 Config = TypeVar("Config", bound=BaseModel)
 
 _NAMES = "the name of a setting is a string"
+#: Greatest number of values in a document, each alias counted as what it stands for.
+_MOST_VALUES = 100_000
 #: Tag of the key ``<<``, which merges another mapping.
 _MERGE = "tag:yaml.org,2002:merge"
 
@@ -128,8 +131,8 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
         if key.strip() in overrides:
             raise ConfigError(f"{key.strip()} is given twice, last as {text!r}; give it once")
         try:
-            overrides[key.strip()] = yaml.load(text, _Loader)
-        except yaml.YAMLError as error:
+            overrides[key.strip()] = _parse(text)
+        except (yaml.YAMLError, *UNREADABLE) as error:
             raise ConfigError(f"{key.strip()}={text!r} is not a YAML value: {_one_line(error)}") from None
     return overrides
 
@@ -142,18 +145,59 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     """
     try:
         with path.open(encoding="utf-8") as stream:
-            content = yaml.load(stream, _Loader)
+            content = _parse(stream)
     except OSError as error:
         raise ConfigError(f"cannot read the configuration {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, *UNREADABLE) as error:
         raise ConfigError(f"{path} is not YAML: {_one_line(error)}") from None
     if content is not None and not isinstance(content, dict):
         raise ConfigError(f"{path} holds a {type(content).__name__}, not settings; write lines of KEY: VALUE")
-    try:
-        json.dumps(content, default=str, skipkeys=True)
-    except ValueError:  # an alias (*name) within its own anchor (&name)
-        raise ConfigError(f"{path} has a value that holds itself; write it out instead of by an alias") from None
     return content or {}
+
+
+def _parse(source: str | IO[str]) -> Any:
+    """Construct the value of a YAML document, whose aliases are expanded within limits.
+
+    Raises:
+        yaml.YAMLError: it is not YAML, or expands to more than :data:`_MOST_VALUES`.
+    """
+    loader = _Loader(source)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _count(node, {})
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _count(node: yaml.Node, counted: dict[yaml.Node, int | None]) -> int:
+    """Count the values below a node, those of an alias (``*name``) once more wherever it stands.
+
+    Args:
+        node: of the document.
+        counted: the counts of nodes so far; None for those that hold this one.
+
+    Raises:
+        yaml.YAMLError: there are too many, or a node holds itself.
+    """
+    if node in counted:
+        if counted[node] is None:
+            raise yaml.constructor.ConstructorError(
+                None, None, "a value holds itself; write it out instead of by an alias", node.start_mark
+            )
+        return counted[node]
+    counted[node], total = None, 1
+    if isinstance(node, yaml.MappingNode):
+        total += sum(_count(part, counted) for pair in node.value for part in pair)
+    elif isinstance(node, yaml.SequenceNode):
+        total += sum(_count(part, counted) for part in node.value)
+    if total > _MOST_VALUES:
+        message = f"more than {_MOST_VALUES} values once aliases are expanded; write fewer"
+        raise yaml.constructor.ConstructorError(None, None, message, node.start_mark)
+    counted[node] = total
+    return total
 
 
 def _read_settings(cls: type[BaseModel], path: Path) -> Mapping[str, Any]:
@@ -332,5 +376,5 @@ def _plain(value: Any, key: str = "") -> Any:
 
 
 def _one_line(error: Exception) -> str:
-    """Return a message without line breaks."""
-    return " ".join(str(error).split())
+    """Return a message without line breaks, or the name of an error without one."""
+    return " ".join(str(error).split()) or type(error).__name__

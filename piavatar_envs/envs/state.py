@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from piavatar_envs.config.errors import shown
+from piavatar_envs.core.reading import UNREADABLE
 
 #: Name of the settings in a state.
 SETTINGS = "env.settings"
@@ -142,7 +143,7 @@ def _compare(saved: np.ndarray, own: np.ndarray) -> None:
     """Refuse the encoded settings of one environment where they differ from ``own``."""
     try:
         then = json.loads(saved.tobytes())
-    except ValueError:  # also raised for bytes that are not text
+    except UNREADABLE:
         raise ValueError(_unreadable("is no text of settings")) from None
     unlike = _first_unlike(then, json.loads(own.tobytes()))
     if unlike:

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from piavatar_envs.avatar.body.sampling import LINK_LENGTH, ClosedSurface
 from piavatar_envs.core.extras import missing
+from piavatar_envs.core.reading import reading
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS, solid_distance
 
 wp.set_module_options({"enable_backward": False})
@@ -167,7 +168,7 @@ def _load(path: Path):
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_FORMATS)}")
     if not path.is_file():
         raise FileNotFoundError(f"no mesh at {path}")
-    try:
+    with reading(path.name, f"a readable {path.suffix} mesh"):
         # a stream, not a path: no materials or buffers are looked up next to it
         stream, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
         loaded = trimesh.load(stream, file_type=kind, force="mesh", process=True, skip_materials=True)
@@ -175,9 +176,6 @@ def _load(path: Path):
         faces = getattr(loaded, "faces", np.empty((0, 3), np.int64))
         shape = trimesh.Trimesh(loaded.vertices, faces, process=True)  # validate would turn a cavity inside out
         shape.update_faces(shape.nondegenerate_faces())
-    except Exception as error:  # parsers of foreign files raise anything
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ValueError(f"{path.name} is not a readable {path.suffix} mesh: {reason}") from None
     if len(shape.faces) == 0:
         raise ValueError(f"{path.name} has no triangles; export a solid, not points, curves or an empty scene")
     if not shape.is_watertight:

@@ -187,7 +187,7 @@ def test_an_evaluation_books_every_agent_until_it_leaves():
     times = {name: np.arange(1, last + 1) for name, last in LEAVES.items()}
     totals = [(100.0 * agent + 10.0 * times[name]).sum() for agent, name in enumerate(NAMES)]
     for episode, seed in zip(result.episodes, (9, 10, 11), strict=True):
-        assert (episode.seed, episode.steps, episode.failure) == (seed, LAST, None)
+        assert (episode.seed, episode.steps, episode.failure) == (seed, LAST, False)
         np.testing.assert_allclose(episode.agent_totals, totals)
         np.testing.assert_array_equal(episode.agent_success, [False, False, True])  # of c's last step, long ago
         assert episode.total == pytest.approx(np.mean(totals))

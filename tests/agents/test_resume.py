@@ -17,13 +17,14 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents.checkpoint import UNREADABLE, Checkpoint, load_weights
+from agents.checkpoint import Checkpoint, load_weights
 from agents.files import hold, write_atomically
 from agents.sb3 import train
 from agents.sb3.config import load_training
 from agents.sb3.learning import begin, learn
 from agents.sb3.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.config import ConfigError, dump_yaml
+from piavatar_envs.core.reading import UNREADABLE
 from tests.agents.conftest import TINY
 from tests.agents.killing import KillAt, Killed, flat, run_killed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from itertools import pairwise
 from typing import Annotated, Literal, get_args, get_origin
 
 import pytest
@@ -125,11 +126,23 @@ def test_an_ambiguous_name_is_refused():
     assert message.startswith("same ") and "left.same or right.same" in message
 
 
+def aliases(first: str, more: str) -> str:
+    """Return YAML of a few lines, each of which has the one before nine times."""
+    names = "abcdefghi"
+    lines = [f"{new}: &{new} {more.format(9 * f'*{old}, ')}" for old, new in pairwise(names)]
+    return "\n".join([f"a: &a {first}", *lines])
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("control: &d {tone: 0.3, more: *d}", "holds itself"),
         ("physics: [1,\n", "bad.yaml is not YAML"),
+        ("physics: " + 3000 * "[", "bad.yaml is not YAML: "),
+        ("physics: \udcff", "bad.yaml is not YAML"),
+        ("physics: \0", "bad.yaml is not YAML"),
+        (aliases("[1]", "[{}]"), "once aliases are expanded"),
+        (aliases("{x: 1}", "{{<<: [{}]}}"), "once aliases are expanded"),
         ("control: !!python/object/apply:os.getcwd []\n", "bad.yaml is not YAML"),
         ("- a\n- b\n", "a list"),
         ("control:\n  tone: 0.1\n  tone: 0.2\n", "'tone' is given twice"),
@@ -142,7 +155,7 @@ def test_an_ambiguous_name_is_refused():
 )
 def test_bad_files_are_refused_with_the_place_of_the_fault(tmp_path, text, words):
     path = tmp_path / "bad.yaml"
-    path.write_text(text)
+    path.write_text(text, errors="surrogateescape")
     assert words in refusal(path)
 
 

@@ -20,7 +20,7 @@ GREEN = (0.0, 1.0, 0.0)
 
 def test_a_missing_viser_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ImportError, match=r'pip install "piavatar-envs\[live\]"'):
+    with pytest.raises(ImportError, match=r"\[live\]"):
         LiveView()
 
 

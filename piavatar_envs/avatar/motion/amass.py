@@ -8,7 +8,6 @@ up. Files are the user's; nothing is unpickled.
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs, leg_length, retarget, root_path
+from piavatar_envs.core.reading import reading
 
 #: Width of ``poses`` -> the key that names the frame rate.
 LAYOUTS: dict[int, str] = {156: "mocap_framerate", 165: "mocap_frame_rate"}
@@ -92,8 +92,11 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
         raise ValueError(f"{path}: AMASS motions are .npz files, nothing else is read (a pickle would run code)")
     if not path.is_file():
         raise FileNotFoundError(f"no motion file {path}")
-    try:
-        with np.load(path, allow_pickle=False) as content:
+    with reading(path, "an AMASS motion"):
+        content = np.load(path, allow_pickle=False)
+        if not isinstance(content, np.lib.npyio.NpzFile):
+            raise ValueError("it is a single array, and not an archive of several")
+        with content:
             keys = set(content.files)
             missing = {"poses", "trans"} - keys
             if missing:
@@ -107,8 +110,6 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
             if rate_key is None:
                 raise ValueError(f"the rate is missing: neither of {sorted(LAYOUTS.values())} is in {sorted(keys)}")
             rate = content[rate_key]
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path} is not an AMASS motion: {error}") from error
     return _checked(path, poses, trans, rate)
 
 

@@ -27,6 +27,7 @@ from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights, pad
 from piavatar_envs.avatar.motion.motion import Motion, ease, hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, leg_length, retarget, root_path
 from piavatar_envs.core.extras import missing
+from piavatar_envs.core.reading import reading
 
 NUM_CHANNELS = 44
 LEG_LENGTH = 0.8314  # [m] hip to knee to ankle of DeepMimic's humanoid (0.4215 + 0.4099)
@@ -148,15 +149,11 @@ def mend_jumps(rotations: np.ndarray, fps: float) -> np.ndarray:
 
 def _read(path: Path) -> tuple[bool, float, np.ndarray]:
     """Return whether it loops, its rate and its frames ``(num_frames, 44)`` at that constant rate."""
-    try:
-        content = json.loads(path.read_text())
+    what = f'a DeepMimic clip (JSON with "Loop" of "wrap" or "none" and "Frames" of {NUM_CHANNELS} numbers each)'
+    with reading(path, what):
+        content = json.loads(path.read_text(encoding="utf-8"))
         loop = {"wrap": True, "none": False}[content["Loop"]]
         frames = np.array(content["Frames"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"{path} is not a DeepMimic clip ({type(error).__name__}: {error}); expected JSON with "
-            f'"Loop" of "wrap" or "none" and "Frames" of {NUM_CHANNELS} numbers each'
-        ) from error
     if frames.ndim != 2 or frames.shape[1] != NUM_CHANNELS or len(frames) < 2:
         raise ValueError(f"{path}: frames of shape {frames.shape}, expected (at least 2, {NUM_CHANNELS})")
     if not np.isfinite(frames).all():

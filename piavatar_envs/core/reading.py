@@ -1,0 +1,48 @@
+"""Files of users: one list of the errors that a damaged or foreign file may raise, and one error instead of them."""
+
+from __future__ import annotations
+
+import lzma
+import pickle
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+#: Errors of parsers (NumPy, zipfile, json, yaml, torch) on content that is damaged, foreign or too deeply nested.
+UNREADABLE: tuple[type[Exception], ...] = (
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError,
+    ValueError, lzma.LZMAError, pickle.UnpicklingError, struct.error, tokenize.TokenError, zipfile.BadZipFile,
+    zlib.error,
+)  # fmt: skip
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of an error's message after the error's name, which alone says what a KeyError is."""
+    lines = str(error).strip().splitlines()
+    named = isinstance(error, ValueError) and type(error).__module__ == "builtins"
+    return ": ".join([*([] if named and lines else [type(error).__name__]), *lines[:1]])
+
+
+@contextmanager
+def reading(path: str | Path, what: str, kind: type[ValueError] = ValueError) -> Iterator[None]:
+    """Raise one error, of one line, for every error of :data:`UNREADABLE` while a file is read.
+
+    Args:
+        path: of the file.
+        what: it should have been, with an article, as ``"an AMASS motion"``.
+        kind: type of the error.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: of ``kind``, it cannot be read.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except UNREADABLE as error:
+        raise kind(f"{path} is not {what}: {first_line(error)}") from error
