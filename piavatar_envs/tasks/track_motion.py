@@ -42,7 +42,7 @@ LONGEST_LEGS = 1.3
 class TrackMotionConfig(EnvConfig):
     """Settings of TrackMotion."""
 
-    motion: str = Field("step", description="name of a clip, or the path of an AMASS .npz file")
+    motion: str = Field("step", description="name of a clip, or the path of an AMASS .npz or a DeepMimic .txt file")
     random_start: bool = Field(True, description="begin anywhere in a clip that loops")
     root_action: bool = Field(True, description="whether x, y and yaw of the root act too")
     impulse: float = Field(20.0, ge=0.0, le=1000.0, description="greatest impulse on the body, 0 for none [N s]")

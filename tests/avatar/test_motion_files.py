@@ -172,6 +172,20 @@ def test_malformed_files_are_refused(tmp_path: Path, changes: dict, message: str
     assert Opened.count == 0
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"trans": np.outer(np.arange(4), [12.0, 0.0, 0.0])}, r"root moves at .* m/s .*millimetres"),  # 1.4 m/s
+        ({"turned": {"left_knee": (90.0, 0.0, 0.0)}}, r"joint turns by 90 rad .*degrees"),
+        ({"mocap_framerate": np.array(1.0 / 120.0)}, r"0\.00833.* frames a second .*of 120 frames"),
+    ],
+)
+def test_units_of_another_kind_are_refused_with_the_likely_cause(tmp_path: Path, changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_motion(write(tmp_path / "clip.npz", **changes))
+    assert load_motion(write(tmp_path / "clip.npz")).fps == 120.0
+
+
 def test_pickles_and_other_files_are_refused_unopened(tmp_path: Path) -> None:
     Opened.count = 0
     for name in ("clip.pkl", "clip.npz", "clip"):
@@ -328,6 +342,15 @@ def test_malformed_clips_are_refused(tmp_path: Path, content: object, message: s
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ValueError, match=message):
         deepmimic.load_file(path, REST)
+
+
+def test_clips_are_loaded_by_path(tmp_path: Path) -> None:
+    motion = load_motion(write_clip(tmp_path, [frame(1 / 30), frame(1 / 30), frame(1 / 30)]))
+    assert motion.fps == pytest.approx(30.0) and motion.root_position[0, 2] > 0.7
+    with pytest.raises(FileNotFoundError, match=r"none\.txt"):
+        load_motion(tmp_path / "none.txt")
+    with pytest.raises(ValueError, match="millimetres"):
+        load_motion(write_clip(tmp_path, [frame(1 / 30, (0.0, 800.0 + 20.0 * n, 0.0)) for n in range(3)]))
 
 
 def test_without_pybullet_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

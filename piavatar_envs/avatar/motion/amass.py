@@ -20,6 +20,7 @@ from piavatar_envs.core.reading import reading
 
 #: Width of ``poses`` -> the key that names the frame rate.
 LAYOUTS: dict[int, str] = {156: "mocap_framerate", 165: "mocap_frame_rate"}
+GREATEST_TURN = 4.0 * np.pi  # [rad] of a joint; axis-angle vectors of recordings may exceed a full turn
 LEG_LENGTH = 0.78  # [m] hip to knee to ankle of a person of SMPL's mean shape, about 1.7 m tall
 HIP_DROP = 0.09  # [m] how far below SMPL's pelvis joint the hips of that person are
 #: Our body axes (z-up, facing -y) to SMPL's (y-up, facing +z); left is +x in both.
@@ -125,4 +126,10 @@ def _checked(
     for key, values in (("poses", poses), ("trans", trans)):
         if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
             raise ValueError(f"{path}: {key} (type {values.dtype}) holds values that are not finite numbers")
+    turns = np.linalg.norm(poses[:, 3 : 3 * NUM_JOINTS].reshape(len(poses), -1, 3), axis=2)
+    if turns.max() > GREATEST_TURN:
+        raise ValueError(
+            f"{path}: a joint turns by {turns.max():.3g} rad in frame {turns.max(axis=1).argmax()}, it must be <= "
+            f"{GREATEST_TURN:.3g}; poses may be in degrees, and must be in radians"
+        )
     return poses[:, : 3 * NUM_JOINTS].astype(np.float64), trans.astype(np.float64), float(rate.reshape(()))

@@ -1,4 +1,4 @@
-"""The registry of motions: embedded clips, registered ones, installed DeepMimic clips, AMASS files by path.
+"""The registry of motions: embedded clips, registered ones, installed DeepMimic clips, files by path.
 
 A new embedded clip is one new file in ``clips/`` with a ``build(rest_joints) -> Motion``; :func:`register_motion` adds
 one from elsewhere.
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
 
 DEEPMIMIC_PREFIX = "deepmimic:"
+RATES = 5.0, 1000.0  # [1/s] of motion capture
+ROOT_SPEED = 20.0  # [m/s] of a pelvis, beyond sprinters and falls
 GROUND_WINDOW = 0.8  # [s] longer than any flight in DeepMimic's clips, whose skeleton stands otherwise than ours
 
 
@@ -66,13 +68,13 @@ def load_motion(name_or_path: str | Path, asset: AvatarAsset | None = None, body
 
     Args:
         name_or_path: an embedded clip (``"squat"``), a registered one, a DeepMimic clip
-            (``"deepmimic:walk"``) or the path of an AMASS ``.npz`` file.
+            (``"deepmimic:walk"``), or the path of an AMASS ``.npz`` or a DeepMimic ``.txt`` file.
         asset: the avatar that shall move; without it the embedded body.
         body: one of its shapes; without it the mean shape. Legs of another length scale the root's path.
 
     Raises:
         ImportError: a DeepMimic clip without the extra ``motions``.
-        ValueError: the name is unknown, or a file is not a motion.
+        ValueError: the name is unknown, or a file is not a motion, or one that no human makes.
         FileNotFoundError: there is no such file.
     """
     asset = load_asset() if asset is None else asset
@@ -85,10 +87,33 @@ def load_motion(name_or_path: str | Path, asset: AvatarAsset | None = None, body
     elif name.startswith(DEEPMIMIC_PREFIX):
         motion = deepmimic.load_installed(name.removeprefix(DEEPMIMIC_PREFIX), joints)
         return lay_hands_on_ground(motion, asset, body, GROUND_WINDOW).on_ground(asset, body, window=GROUND_WINDOW)
+    elif Path(name).suffix.lower() == ".txt":
+        motion = _checked(name, deepmimic.load_file(name, joints))
+        return lay_hands_on_ground(motion, asset, body, GROUND_WINDOW).on_ground(asset, body, window=GROUND_WINDOW)
     elif isinstance(name_or_path, Path) or Path(name).suffix or "/" in name:
-        motion = amass.load_file(name, joints)
+        motion = _checked(name, amass.load_file(name, joints))
     else:
         raise ValueError(
-            f"unknown motion {name!r}; known are {', '.join(list_motions())}, or the path of an AMASS .npz file"
+            f"unknown motion {name!r}; known are {', '.join(list_motions())}, or the path of an AMASS .npz or a "
+            "DeepMimic .txt file"
         )
     return motion.on_ground(asset, body)
+
+
+def _checked(path: str, motion: Motion) -> Motion:
+    """Return the motion of a file, if a human could make it.
+
+    Raises:
+        ValueError: its rate or the speed of its root is out of range; names the likely cause.
+    """
+    if not RATES[0] <= motion.fps <= RATES[1]:
+        cause = f"it may be the time between frames [s], of {1.0 / motion.fps:g} frames a second"
+        raise ValueError(f"{path}: {motion.fps:g} frames a second must be in [{RATES[0]:g}, {RATES[1]:g}]; {cause}")
+    steps = motion.fps * np.linalg.norm(np.diff(motion.root_position, axis=0), axis=1)
+    if steps.max() > ROOT_SPEED:
+        cause = "its lengths may be in millimetres or centimetres and not in metres, or its frame rate too high"
+        raise ValueError(
+            f"{path}: the root moves at {steps.max():.3g} m/s in frame {steps.argmax()}, it must be <= {ROOT_SPEED:g}; "
+            f"{cause}"
+        )
+    return motion
