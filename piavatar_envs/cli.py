@@ -197,7 +197,7 @@ def main(args: list[str] | None = None) -> None:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="piavatar-envs", description="Soft human avatars behind reset/step.", args=args
         )
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     except SystemExit as stop:  # the parser has printed its complaint

@@ -126,9 +126,11 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         environments: also step each environment once, because some kernels are generated for their sizes.
 
     Raises:
+        KernelCacheError: Warp's cache cannot be written.
         ValueError: Warp has no such device.
     """
     wp = quiet_warp()
+    from piavatar_envs.core.kernel_cache import unusable
     from piavatar_envs.core.launch_graph import acquire
 
     target = wp.get_device(find_device(device))
@@ -139,7 +141,10 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
     acquire(target)
-    wp.force_load(target, max_workers=compiling_threads())
+    try:
+        wp.force_load(target, max_workers=compiling_threads())
+    except OSError as error:
+        raise unusable(error) from error
     for env_id, spec in sorted(gymnasium.registry.items()):
         if environments and spec.namespace == "PIAvatar":
             env = gymnasium.make(env_id, device=device, fidelity="tiny")
@@ -180,8 +185,10 @@ def quiet_warp() -> ModuleType:
     """Return Warp, initialised without its banner, which would spoil the JSON on stdout."""
     import warp as wp
 
+    from piavatar_envs.core.kernel_cache import init_warp
+
     wp.config.log_level = wp.LOG_WARNING
-    wp.init()
+    init_warp()
     return wp
 
 

@@ -17,6 +17,8 @@ from typing import Any, TypeVar
 
 import warp as wp
 
+from piavatar_envs.core.kernel_cache import load_module
+
 T = TypeVar("T")
 #: Most modules compiled at the same time: each takes some hundred megabytes.
 MAX_COMPILING_THREADS = 16
@@ -242,6 +244,7 @@ def compile_graphs(graphs: Iterable[LaunchGraph]) -> None:
     """Compile what the graphs launch and Warp's cache lacks, modules in parallel, then bind all arguments.
 
     Raises:
+        KernelCacheError: Warp's cache cannot be written.
         Exception: a kernel does not compile, or a launch has arguments of the wrong types, as Warp reports it.
     """
     graphs = list(graphs)
@@ -251,7 +254,7 @@ def compile_graphs(graphs: Iterable[LaunchGraph]) -> None:
         modules = {
             (new.kernel.module, each.device.alias, new.block_dim): None for each in graphs for new in each.unbound
         }
-        loads = [pool.submit(wp.load_module, m, d, block_dim=dim, max_workers=0) for m, d, dim in modules]
+        loads = [pool.submit(load_module, module, wp.get_device(d), dim) for module, d, dim in modules]
         for load in loads:
             load.result()
     for graph in graphs:

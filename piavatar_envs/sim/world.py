@@ -18,6 +18,7 @@ from piavatar_envs.avatar.controller import Controller
 from piavatar_envs.avatar.pose_control.controller import PoseController
 from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.config import AvatarConfig, EnvConfig, SceneConfig, replace
+from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.contact_sensors import clear_masked_sensors
@@ -305,8 +306,10 @@ def check_device(device: str) -> str:
     """Return the name of an available Warp device.
 
     Raises:
+        KernelCacheError: Warp cannot create the folder of its compiled kernels.
         ValueError: there is no such device.
     """
+    init_warp()
     device = str(device)  # a torch.device as well
     if device.startswith("cuda") and not wp.get_cuda_device_count():
         raise ValueError(f"device={device!r} is not available (no CUDA device, or no driver for one); use one of cpu")

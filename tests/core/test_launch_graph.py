@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.kernel_cache import KernelCacheError
+from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
 from tests.gpu_on_cpu import NAME as GPU_ON_CPU
 
 
@@ -131,3 +132,39 @@ def test_a_launch_with_wrong_arguments_is_refused_before_anything_runs(device):
 def test_bad_conditions(device, shape, dtype):
     with pytest.raises(ValueError, match=r"use \(1,\) int32"):
         LaunchGraph(device, wp.zeros(shape, dtype=dtype, device=device))
+
+
+@wp.kernel(module="unique")
+def write_index(out: wp.array(dtype=int)):
+    out[wp.tid()] = wp.tid()
+
+
+def written_by_its_own_module() -> list[int]:
+    """Compile or load a kernel of a module of its own, and return what it writes."""
+    write_index.module.unload()
+    out = wp.zeros(3, dtype=int, device="cpu")
+    graph = LaunchGraph("cpu")
+    graph.launch(write_index, 3, [], [out])
+    compile_graphs([graph])
+    graph.run()
+    return out.numpy().tolist()
+
+
+@pytest.mark.parametrize("content", [b"", b"damaged"])
+def test_damaged_objects_of_the_cache_are_compiled_anew(tmp_path, monkeypatch, content):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    assert written_by_its_own_module() == [0, 1, 2]
+    for suffix in (".o", ".meta"):
+        [path] = tmp_path.rglob(f"*{suffix}")
+        path.write_bytes(content)
+        assert written_by_its_own_module() == [0, 1, 2]
+        assert path.read_bytes() != content
+
+
+def test_a_cache_that_cannot_be_written_is_named_with_the_remedy(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file" / "cache"))
+    with pytest.raises(KernelCacheError, match=r"file/cache .*WARP_CACHE_PATH") as caught:
+        written_by_its_own_module()
+    assert "\n" not in str(caught.value)
+    write_index.module.unload()

@@ -1,0 +1,57 @@
+"""Warp's cache of compiled kernels: an unusable folder is named, and damaged objects are compiled anew."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+
+class KernelCacheError(OSError):
+    """The folder of compiled kernels cannot be used; one line with the folder and the remedy."""
+
+
+def init_warp() -> None:
+    """Initialise Warp, which creates the folder of its cache; initialising it again does nothing.
+
+    Raises:
+        KernelCacheError: the folder cannot be created.
+    """
+    try:
+        wp.init()
+    except OSError as error:
+        raise unusable(error) from error
+
+
+def unusable(error: OSError) -> KernelCacheError:
+    """Return the error of a cache that cannot be written or read."""
+    folder = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH") or error.filename
+    return KernelCacheError(
+        f"Warp cannot keep compiled kernels in {folder} ({error.strerror or error}); name a folder that can be written "
+        "and has space in the environment variable WARP_CACHE_PATH"
+    )
+
+
+def load_module(module: Any, device: wp.Device, block_dim: int) -> None:
+    """Load the kernels of a Warp module, compiled where the cache lacks them; a damaged entry is compiled anew.
+
+    Raises:
+        KernelCacheError: the cache cannot be written.
+        Exception: a kernel does not compile, as Warp reports it.
+    """
+    try:
+        try:
+            wp.load_module(module, device, block_dim=block_dim, max_workers=0)
+        except Exception as error:
+            entry = Path(wp.config.kernel_cache_dir) / module.get_module_identifier(1 if device.is_cpu else block_dim)
+            damaged = isinstance(error, (ValueError, FileNotFoundError)) or "Failed to load" in str(error)
+            if not (damaged and entry.is_dir()):
+                raise
+            shutil.rmtree(entry, ignore_errors=True)
+            module.unload()
+            wp.load_module(module, device, block_dim=block_dim, max_workers=0)
+    except OSError as error:
+        raise unusable(error) from error
