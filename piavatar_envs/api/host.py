@@ -300,6 +300,7 @@ class EpisodeHost:
         return {
             "success": self.read(lambda batch: batch.success)[:, agent],
             "failure": self.read(lambda batch: batch.failure),
+            "limited_share": self.read(lambda batch: batch.simulation.sensors.limited),
             # a failed environment may hold numbers that are not finite, which must not leave the suite
             "root_force": self.api.finite(drive("wrench_force")),
             "root_torque": self.api.finite(drive("wrench_torque")),

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 REWARD, COST = "reward_", "cost_"
 #: Keys of every environment's ``info`` and of its views; no metric can have these names.
 NAMES_OF_INFO = (
-    "success", "failure", "root_force", "root_torque", "root_released", "cost",
+    "success", "failure", "limited_share", "root_force", "root_torque", "root_released", "cost",
     "final_info", "final_obs", "final_state", "episode", "is_success", "terminal_observation", "TimeLimit.truncated",
     "acted", "alive", "time_outs", "log",
 )  # fmt: skip

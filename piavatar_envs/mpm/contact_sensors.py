@@ -1,4 +1,4 @@
-"""Contact sensors: impulses by subject, pair and body part over a control step, and penetration depths.
+"""Contact sensors: impulses by subject, pair and body part over a control step, penetration depths, limited motion.
 
 Impulses are accumulated in fixed point, so that the sum does not depend on their order. The entries of an environment:
 colliders on every subject, every pair of subjects, every subject on every row of the contact sensor, and moments of the
@@ -30,13 +30,33 @@ from piavatar_envs.mpm.sparse_grid import (
     record_of,
     slab_records,
 )
-from piavatar_envs.mpm.types import NEAR_FIELD, Blocks, Contact, Grid, Model, Particles, Sensors, row
+from piavatar_envs.mpm.types import (
+    FAILURE_CFL,
+    FAILURE_OUT_OF_GRID,
+    NEAR_FIELD,
+    Blocks,
+    Contact,
+    Grid,
+    Model,
+    Particles,
+    Sensors,
+    row,
+)
 
 # an unrolled stencil needs so many registers that a GPU runs few threads at once
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 #: Quanta of a newton second: sums resolve 1e-12 N s and reach 8e6 N s.
 QUANTA_PER_NEWTON_SECOND = wp.constant(float(2**40))
+#: Limits of a particle's motion: to a grid spacing a substep, to the grid, and of its stretch.
+SLOWED, HELD, STRETCHED = wp.constant(1), wp.constant(2), wp.constant(3)
+#: Quanta of the share of the mass that was limited in a substep.
+QUANTA_OF_LIMITED = wp.constant(float(2**40))
+#: Share of an environment's mass, on average over the substeps of a control step, that may be limited.
+LIMITED_SHARE = 0.05
+_LIMITED_SHARE = wp.constant(LIMITED_SHARE)
+_CFL = wp.constant(FAILURE_CFL)
+_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
 #: Volume fraction of another subject at which a particle lies on its surface.
 SURFACE = wp.constant(0.5)
 #: Slope of the volume fraction at a flat surface times the grid spacing: a step seen through the spline twice has the
@@ -94,6 +114,9 @@ def clear_environment(e: int, sensors: Sensors):
         sensors.boundary_impulse[e, s] = wp.vec3(0.0)
         sensors.boundary_moment[e, s] = wp.vec3(0.0)
         sensors.penetration[e, s] = 0.0
+    for n in range(2):
+        sensors.limited_sum[e, n] = wp.int64(0)
+    sensors.limited[e] = 0.0
     for s in range(sensors.pair_impulse.shape[1]):
         sensors.pair_impulse[e, s] = wp.vec3(0.0)
     for i in range(sensors.part_impulse.shape[1]):
@@ -130,6 +153,29 @@ def read_impulses(sensors: Sensors):
         sensors.part_impulse[e, n // subjects, n % subjects] = J
     else:
         sensors.boundary_moment[e, entry - moment_entry(sensors, 0)] = J
+
+
+@wp.func
+def add_limited(sensors: Sensors, particles: Particles, e: int, p: int, limit: int):
+    """Add a particle that a substep has limited, by its share of the mass."""
+    share = wp.int64(wp.rint(QUANTA_OF_LIMITED * particles.share[p]))
+    wp.atomic_add(sensors.limited_sum, e, wp.where(limit == HELD, 1, 0), share)
+
+
+@wp.kernel
+def check_limited(substeps: int, sensors: Sensors, failure: wp.array(dtype=int)):
+    """Write the share of an environment's mass that was limited, averaged over the ``substeps`` of a control step.
+
+    Above :data:`LIMITED_SHARE` it flags a failure, because the motion as a whole is then not that of the velocities:
+    ``out_of_grid`` if the grid has held most of it, ``cfl`` otherwise.
+    """
+    e = wp.tid()
+    per_quantum = 1.0 / (QUANTA_OF_LIMITED * float(substeps))
+    fast = per_quantum * float(sensors.limited_sum[e, 0])
+    held = per_quantum * float(sensors.limited_sum[e, 1])
+    sensors.limited[e] = fast + held
+    if fast + held > _LIMITED_SHARE:
+        wp.atomic_or(failure, e, wp.where(held > fast, _OUT_OF_GRID, _CFL))
 
 
 @wp.func

@@ -215,4 +215,6 @@ def allocate_sensors(model: Model, records: tuple[int, int]) -> Sensors:
         node=_zeros(model, records, wp.vec4),
         touched=_zeros(model, (records[0], -(-records[1] // int(BLOCK_NODES))), int),
         penetration=_zeros(model, (n, subjects), float),
+        limited_sum=_zeros(model, (n, 2), wp.int64),
+        limited=_zeros(model, n, float),
     )

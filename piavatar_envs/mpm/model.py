@@ -401,7 +401,9 @@ def upload_points(
         scalar = np.int32 if dtype is int else np.float32
         return wp.array(np.ascontiguousarray(value, scalar), dtype=dtype, device=device)
 
-    particles.mass = upload(points.volume * points.density, float)
+    mass = points.volume * points.density
+    particles.mass = upload(mass, float)
+    particles.share = upload(mass[0] / mass[0].sum(), float)
     particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
     particles.retardation = upload(points.retardations, float)
     particles.material = upload(points.material, int)

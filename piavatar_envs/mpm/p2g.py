@@ -42,6 +42,8 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 #: Most momentum quanta of a particle: those of 4,000 full cells that move a grid spacing a time step.
 MAX_QUANTA = wp.constant(float(2**48))
+#: A particle that would move or is driven further in a substep [grid spacings] has failed.
+MOST_CELLS = wp.constant(8.0)
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _BLOCKS = wp.constant(FAILURE_BLOCKS)
 _CFL = wp.constant(FAILURE_CFL)

@@ -20,6 +20,7 @@ from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact import solve_contact
 from piavatar_envs.mpm.contact_normals import find_volume_gradients
 from piavatar_envs.mpm.contact_sensors import (
+    check_limited,
     clear_sensors,
     read_impulses,
     sense_contact,
@@ -149,7 +150,7 @@ def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch)
     """Append G2P: particles take velocity and its gradient from the nodes, move, and update ``F``."""
     m = model
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
-    outputs = [scratch.blocks, _moving(state), state.failure]
+    outputs = [scratch.blocks, _moving(state), state.failure, scratch.sensors]
     if m.path == "plain":
         graph.launch(g2p, state.x.shape, inputs, outputs, block_dim=G2P_THREADS)
     else:
@@ -157,7 +158,7 @@ def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch)
             tiled_g2p,
             m.num_envs * m.num_particles,
             [*inputs, int(senses_in_g2p(m))],
-            [*outputs, scratch.sensors],
+            outputs,
             block_dim=G2P_THREADS,
         )
 
@@ -233,3 +234,4 @@ def record_end(
             [scratch.sensors.penetration],
         )
     graph.parallel(impulses, depths, *branches)
+    graph.launch(check_limited, m.num_envs, [m.num_substeps], [scratch.sensors, state.failure])

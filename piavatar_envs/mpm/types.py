@@ -93,6 +93,7 @@ class Particles:
     field: wp.array(dtype=int)  # (num_particles,) velocity field
     seam: wp.array(dtype=float)  # (num_particles,) 1 where two fields of a subject merge, else 0
     sensor: wp.array(dtype=int)  # (num_particles,) row of the contact sensor, -1 for none
+    share: wp.array(dtype=float)  # (num_particles,) share of the mass of all, as built
     tiles: wp.array(dtype=wp.vec2i)  # (G + 1,) :func:`piavatar_envs.mpm.cuda.tiled_p2g.plan_tiles`
 
 
@@ -123,6 +124,8 @@ class Sensors:
     node: wp.array2d(dtype=wp.vec4)
     touched: wp.array2d(dtype=int)  # (num_envs, A) not 0: ``node`` has changes in this active block in this substep
     penetration: wp.array2d(dtype=float)  # (num_envs, S) deepest particle of a subject inside another [m]
+    limited_sum: wp.array2d(dtype=wp.int64)  # (num_envs, 2) see :func:`piavatar_envs.mpm.contact_sensors.add_limited`
+    limited: wp.array(dtype=float)  # (num_envs,) see :func:`piavatar_envs.mpm.contact_sensors.check_limited`
 
 
 @wp.struct

@@ -33,6 +33,7 @@ FRAMES = {
 INFO_DOCS = {
     "success": "whether the state is a success, see above",
     "failure": "code of the cause for which the simulation has failed; 0 while it has not",
+    "limited_share": "share of all mass whose speed or stretch was limited to what the time step allows",
     "root_force": "force of the root wrench on the body, its mean over the step, in the world [N]",
     "root_torque": "its torque about the body's centre of mass [N m]",
     "root_released": "whether the root wrench has been released, which lasts until the end of the episode",
@@ -40,8 +41,8 @@ INFO_DOCS = {
 }
 FAILURE_DOCS = {
     "nonfinite": "a velocity or a deformation is not finite",
-    "out_of_grid": "the body has left the domain",
-    "cfl": "flesh moves too fast for the time step",
+    "out_of_grid": "more than a twentieth of the matter is at the edge of the domain, or a body has left it",
+    "cfl": "more than a twentieth of the matter is too fast or too stretched for the time step",
     "action": "an action was not finite",
     "blocks": "the flesh is spread over more blocks of the grid than have memory",
     "force": "an external force was not finite, or one too many",

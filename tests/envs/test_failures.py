@@ -102,8 +102,8 @@ def test_absurd_stiffness_at_a_forced_time_step(make_env, sample_id, equal, stif
 
 
 def test_joints_that_turn_too_fast_fail_by_name(make_env, sample_id, equal):
-    """Command joints at 50 rad/s, an order beyond a human: particles cross more than a cell a substep."""
-    env = make_env(sample_id, control="pose", joint_speed_limit=50.0, num_substeps=10)
+    """Command joints at 50 rad/s, an order beyond a human: limbs cross more than a cell a substep."""
+    env = make_env(sample_id, control="pose", joint_speed_limit=50.0, num_substeps=4)
     expected = play(env)
     env.reset(seed=0)
     rng, failures = np.random.default_rng(3), set()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from piavatar_envs.mpm.contact_sensors import LIMITED_SHARE
+from piavatar_envs.mpm.model import Fields
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -117,3 +119,73 @@ def test_what_a_failure_leaves_does_not_depend_on_the_order_of_the_particles(sim
     step = 0.3 * float(sim.model.step.dt)
     for motion in moved:
         np.testing.assert_allclose(motion[far], np.tile([step, 0.0, 0.0], (far.sum(), 1)), atol=1e-6)
+
+
+def limited_bar(simulate, speeds):
+    """Build 100 particles in line, four grid spacings apart, with ``speeds`` across it.
+
+    Speeds are in grid spacings a substep.
+    """
+    rest = np.zeros((100, 3))
+    rest[:, 0] = 0.2 * np.arange(100)
+    kwargs = {"fields": Fields(), "num_substeps": 2, "control_dt": 2e-3}  # fields: sensors cover a control step
+    sim = simulate((0.0, 0.0, 0.0), (20.0, 0.0, 0.0), rest=rest, **kwargs)
+    u = np.zeros((100, 3))
+    u[:, 1] = np.asarray(speeds) * float(sim.model.grid.dx) / float(sim.model.step.dt)
+    return sim.set(u=u)
+
+
+def test_a_fast_particle_moves_a_grid_spacing_and_keeps_all_momentum(simulate):
+    speeds = np.zeros(100)
+    speeds[10] = 3.0
+    sim = limited_bar(simulate, speeds)
+    before = sim.totals()
+    sim.run()
+    after = sim.totals()
+    assert sim.failures == [0]
+    way = np.linalg.norm(sim.get("x") - sim.rest, axis=1) / float(sim.model.grid.dx)
+    assert way[10] == pytest.approx(2.0, rel=1e-5)  # in two substeps
+    np.testing.assert_allclose(after.momentum, before.momentum, atol=1e-6 * before.momentum_scale)
+    np.testing.assert_allclose(after.angular_momentum, before.angular_momentum, atol=1e-5 * before.momentum_scale)
+    assert sim.scratch.sensors.limited.numpy()[0] == pytest.approx(1 / 100)
+
+
+@pytest.mark.parametrize("count", [4, 6])
+def test_limited_motion_of_more_than_a_share_of_the_mass_is_a_failure(simulate, count):
+    speeds = np.zeros(100)
+    speeds[: 10 * count : 10] = 2.0
+    sim = limited_bar(simulate, speeds).run()
+    share = sim.scratch.sensors.limited.numpy()[0]
+    assert share == pytest.approx(count / 100)
+    assert sim.failures == [FAILURE_CFL if share > LIMITED_SHARE else 0]
+
+
+def test_stretch_is_limited_and_keeps_momentum(simulate):
+    # One particle of 512 lies alone and is stretched. Its stress would turn it inside out in a substep.
+    sim = simulate(num_substeps=1, control_dt=1e-3, poisson_ratio=0.45)
+    rest = sim.rest.copy()
+    rest[PARTICLE] = (0.4, 0.4, 0.4)
+    F = np.tile(np.eye(3), (len(rest), 1, 1))
+    F[PARTICLE] = np.diag([5.0, 0.8, 0.4])
+    sim.set(x=rest, F=F)
+    before, first = sim.totals(), sim.run().get("F")[PARTICLE]
+    assert 3.0 < (first**2).sum() < 9.5 and 0.5 < np.linalg.det(first) < 2.0
+    for _ in range(40):
+        after = sim.run().totals()
+        assert after.elastic + after.kinetic < before.elastic
+    assert sim.failures == [0]
+    np.testing.assert_allclose(after.momentum, before.momentum, atol=1e-6)
+    np.testing.assert_allclose(after.angular_momentum, before.angular_momentum, atol=1e-6)
+
+
+def test_matter_at_the_edge_of_the_grid_is_held_and_keeps_its_momentum(simulate):
+    speeds = np.zeros(100)
+    speeds[10] = 0.9  # the grid ends 0.5 m aside, which is ten spacings
+    sim = limited_bar(simulate, speeds).run(10)
+    before = sim.totals()
+    sim.run(5)
+    assert sim.failures == [0]
+    np.testing.assert_allclose(sim.totals().momentum, before.momentum, atol=1e-6 * before.momentum_scale)
+    assert sim.scratch.sensors.limited.numpy()[0] == pytest.approx(1 / 100)
+    everything = limited_bar(simulate, np.full(100, 0.9)).run(10)
+    assert everything.failures == [FAILURE_OUT_OF_GRID]

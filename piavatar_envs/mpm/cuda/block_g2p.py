@@ -218,6 +218,7 @@ def g2p_from_subblocks(
     arena: Arena,
     moved: Moving,
     failure: wp.array(dtype=int),
+    sensors: Sensors,
     e: int,
     p: int,
 ):
@@ -233,7 +234,8 @@ def g2p_from_subblocks(
         kinematic.mean = kinematic_from_subblocks(arena, subblocks, stencil)
     physical = physical_from_subblocks(subblocks, stencil)
     return advance_particle(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, needed, stencil
+        grid, step, particles, boundaries, blocks, moved, failure, sensors, e, p, physical, kinematic, needed,
+        stencil,
     )  # fmt: skip
 
 
@@ -248,6 +250,7 @@ def g2p_all(
     arena: Arena,
     moved: Moving,
     failure: wp.array(dtype=int),
+    sensors: Sensors,
     e: int,
     fails: bool,
     outside: bool,
@@ -261,7 +264,9 @@ def g2p_all(
             s = Advanced()
             stays = fails or p < start + t
             if not stays:
-                s, _ = g2p_particle(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+                s, _ = g2p_particle(
+                    grid, step, particles, boundaries, node_velocity, blocks, moved, failure, sensors, e, p
+                )
             sync_warp()
             store_particle(moved, e, p, s, not stays and s.fault == 0)
     else:
@@ -270,6 +275,6 @@ def g2p_all(
             s = Advanced()
             stays = fails or p < start + t
             if not stays:
-                s = g2p_from_subblocks(grid, step, particles, boundaries, blocks, arena, moved, failure, e, p)
+                s = g2p_from_subblocks(grid, step, particles, boundaries, blocks, arena, moved, failure, sensors, e, p)
             sync_warp()
             store_particle(moved, e, p, s, not stays and s.fault == 0)

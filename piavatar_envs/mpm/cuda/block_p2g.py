@@ -50,7 +50,15 @@ from piavatar_envs.mpm.cuda.block_grid import (
     subblocks_of_round,
     sums_at,
 )
-from piavatar_envs.mpm.p2g import Deposit, deposit_of, empty_deposit, fault_within, has_finite_velocity, momentum_bounds
+from piavatar_envs.mpm.p2g import (
+    MOST_CELLS,
+    Deposit,
+    deposit_of,
+    empty_deposit,
+    fault_within,
+    has_finite_velocity,
+    momentum_bounds,
+)
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -68,8 +76,6 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 _CFL = wp.constant(FAILURE_CFL)
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
-#: A particle that moves or is driven further in a substep [grid spacings] has failed, and is not added.
-MOST_CELLS = wp.constant(8.0)
 
 
 # Additions to the same bank conflict. So each thread has its own order, from the bits of its particle's index: two bits

@@ -108,7 +108,7 @@ def run_substep(
         arena.speed[e, t] = speed_for(float_word(FASTEST + t))
     if with_g2p:
         g2p_all(
-            grid, step, particles, boundaries, node_velocity, blocks, arena, moved, failure, e, fails, writes
+            grid, step, particles, boundaries, node_velocity, blocks, arena, moved, failure, sensors, e, fails, writes
         )  # fmt: skip
 
 

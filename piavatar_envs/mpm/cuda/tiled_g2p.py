@@ -8,23 +8,11 @@ from piavatar_envs.core.cuda_intrinsics import environment_of
 from piavatar_envs.mpm.bspline import grid_position
 from piavatar_envs.mpm.contact_sensors import sense_near_field
 from piavatar_envs.mpm.g2p import Advanced, g2p_particle, store_particle
-from piavatar_envs.mpm.types import (
-    FAILURE_CFL,
-    FAILURE_NONFINITE,
-    Blocks,
-    Boundaries,
-    Grid,
-    Moving,
-    Particles,
-    Sensors,
-    Step,
-)
+from piavatar_envs.mpm.types import Blocks, Boundaries, Grid, Moving, Particles, Sensors, Step
 
 # fast_math: divisions and roots to two units in the last place, logarithms to 4e-7, without function calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-_NONFINITE = wp.constant(FAILURE_NONFINITE)
-_CFL = wp.constant(FAILURE_CFL)
 #: Threads of a CUDA block of G2P.
 THREADS = 128
 
@@ -56,6 +44,6 @@ def tiled_g2p(
     if not stays:
         if senses != 0:
             sense_near_field(grid, particles, blocks, sensors, e, p, grid_position(grid, moved.x[e, p]))
-        s, _ = g2p_particle(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+        s, _ = g2p_particle(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, sensors, e, p)
         stays = s.fault != 0
     store_particle(moved, e, p, s, not stays)
