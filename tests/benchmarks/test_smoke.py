@@ -19,7 +19,7 @@ from benchmarks.paper.stage import Act, keyed, perform
 from benchmarks.physics import blows, contact, elastodynamics, stability, torque, wear
 from benchmarks.physics.limbs import Options
 from benchmarks.physics.rig import Rig, World
-from benchmarks.speed import cpu, plain_mpm, profile, soak, steps, vector
+from benchmarks.speed import cpu, failures, plain_mpm, profile, soak, steps, vector
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import PoseControlConfig
@@ -93,6 +93,17 @@ def test_a_soak_run_continues_where_it_was_stopped(tmp_path, device):
     files.write_json(out, json.loads(out.read_text()) | {"complete": False, "results": first[:2]})
     with pytest.raises(ValueError, match="options"):
         run(soak, out, device, *small, "--steps", "8")
+
+
+def test_failures_are_counted_by_control_mode(tmp_path, device):
+    small = ["--fidelity", "tiny", "--num-envs", "2", "--env-steps", "5"]
+    rows = run(
+        failures, tmp_path / "failures.json", device, "--worlds", "PIAvatar/Stand-v0", "PIAvatar/Reach-v0", *small
+    )
+    assert [row["case"].split()[1] for row in rows] == 2 * ["pose", "pd", "torque"]
+    steps = [row["env_steps"] for row in rows if row["refused"] is None]
+    assert len(steps) >= 4 and set(steps) == {6}
+    assert all(row["failures"]["cfl"] == 0 and row["limited_share_max"] < 0.05 for row in rows if not row["refused"])
 
 
 def test_cpu_rates_are_consistent(tmp_path, monkeypatch):
