@@ -85,6 +85,8 @@ def prop(**settings) -> dict:
         (prop(position=[0, 0, 0, 0]), "scene.props.0.position=[0, 0, 0, 0]", "at most 3"),
         (prop(name=""), "scene.props.0.name=''", "at least 1 character"),
         (prop(size=[-1]), "scene.props.0.size.0=-1", "> 0 [m]"),
+        (prop(damping_ratio=-0.1), "scene.props.0.damping_ratio=-0.1", ">= 0"),
+        ({"physics": {"viscosity": -1.0}}, "physics.viscosity=-1.0", ">= 0 [Pa s]"),
         (prop(rotation=[1e-9, 0, 0, 0]), "scene.props.0.rotation", "not zero"),
     ],
 )

@@ -34,6 +34,7 @@ def meet(simulate) -> Callable[..., Matter]:
         normals: str = "shared",
         spacing: float = 0.025,
         stiffness: float = 100.0,
+        retardation: float = 0.0,
         domain: Sequence[Sequence[float]] = ((-1.0, -0.8, -0.8), (1.0, 0.8, 0.8)),
         **kwargs,
     ) -> Matter:
@@ -43,7 +44,7 @@ def meet(simulate) -> Callable[..., Matter]:
         fields = Fields(tuple(range(len(bodies))), friction, density, gate, normals, len(bodies))
         field = np.repeat(np.arange(len(bodies)), counts)
         points = replace(
-            MaterialPoints.uniform(np.full(len(field), spacing**3)),
+            MaterialPoints.uniform(np.full(len(field), spacing**3), retardation=retardation),
             density=density[None, field],
             young_modulus=stiffness * density[None, field],
             field=field,

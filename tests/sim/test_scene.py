@@ -103,6 +103,8 @@ def test_viscous_matter_sets_the_time_step(device):
     plain, viscous = (world(device, settings={"damping_ratio": ratio}) for ratio in (0.0, 0.5))
     drawn = world(device, settings={"damping_ratio": 0.5, "randomize": {"stiffness_factor": (1.0, 1.5)}})
     assert plain.model.num_substeps < viscous.model.num_substeps < drawn.model.num_substeps
+    with pytest.raises(ValueError, match=f"num_substeps >= {viscous.model.num_substeps}, or less viscosity"):
+        world(device, settings={"damping_ratio": 0.5, "num_substeps": viscous.model.num_substeps - 1})
 
 
 def test_props_begin_inside_the_domain(device):
