@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -215,7 +215,7 @@ def legs_pressed(options: Options) -> Iterator[Quantity]:
             probe.step(action)
     errors = np.degrees(np.linalg.norm(probe.errors, axis=1))[1:]
     worst = JOINT_NAMES[1 + int(errors.argmax())].replace("_", " ")
-    yield at_most(f"largest error of a joint 4 s later ({worst})", errors.max(), 1.0, "deg", theory=0.0)
+    yield replace(at_most("largest error of a joint 4 s later", errors.max(), 1.0, "deg", theory=0.0), note=worst)
 
 
 def kick(action: np.ndarray, step: int, _rng: np.random.Generator) -> None:
@@ -277,10 +277,10 @@ for _name, _title in MOTION_TITLES.items():
 
 @check("sag_pose", "flesh of 1e4 Pa on a standing body, its weight (pose)")
 def sag_pose(options: Options) -> Iterator[Quantity]:
-    """Let soft flesh hang on bones: its sag is as that under pd, where the joints carry the bones."""
+    """Let soft flesh hang on bones: it has weight, as under pd, where the joints carry the bones."""
     sags = {}
     for control in ("pose", "pd"):
         probe = Probe.under(options, control, young_modulus=1.0e4, scene={"ground": False})
         probe.run(SETTLING)
         sags[control] = 1e3 * float(probe.displacement().mean())
-    yield at_least("mean sag over that under pd", sags["pose"] / sags["pd"], 0.5, theory=1.0)
+    yield at_least("mean sag over that under pd", sags["pose"] / sags["pd"], 0.5)

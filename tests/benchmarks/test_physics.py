@@ -108,6 +108,24 @@ def test_gates_are_spacings_or_lengths():
         resolution.gate_in_spacings("8", 0.05)
 
 
+def test_the_study_of_resolution_reads_other_rows_and_draws(tmp_path, device):
+    pytest.importorskip("matplotlib")
+    first, second = tmp_path / "first.json", tmp_path / "second.json"
+    small = ["--device", device, "--balls", "chest"]
+    report = runner.main(
+        "resolution", resolution.cases, resolution.Options, [*small, "--fidelities", "tiny", "--out", str(first)]
+    )
+    (row,) = report["results"]
+    # momentum of a ball that stops is 6 N s; one that bounces gives up to twice that
+    assert 6.0 < row["impulse_n_s"] < 12.0 and 0.0 < row["restitution"] < 1.0 and row["dent_mm"] > 1.0
+    arguments = [*small, "--fidelities", "--also", str(first), "--out", str(second)]
+    assert (
+        runner.main("resolution", resolution.cases, resolution.Options, arguments)["results"][0]["dent_mm"]
+        == row["dent_mm"]
+    )
+    assert second.with_suffix(".png").stat().st_size > 5_000
+
+
 @pytest.mark.parametrize("name", ["wear_prop", "stiffness_ankle_pd", "springs_weight", "root_force_pd", "fast_chest"])
 def test_checks_run(options, name):
     rows = list(CHECKS[name].rows(options))
