@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -17,8 +18,9 @@ from gymnasium.utils import seeding
 from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.pictures import Live, Pictures
 from piavatar_envs.avatar.torque_control.controller import checked_assist
-from piavatar_envs.config import EnvConfig
+from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.config import replace as replace_settings
+from piavatar_envs.config.load import plain
 from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.core.rng import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
@@ -341,7 +343,9 @@ class EpisodeHost:
                 has changed then.
         """
         check_state(state, self.num_envs)
-        check_settings(state, self.config)  # of all environments, before any of the groups has changed
+        check_settings(
+            state, self.config, self.groups[0].files
+        )  # of all environments, before any of the groups has changed
         self.adopt(state, ready=True)
         if self.live:
             self.live.begin()
@@ -526,13 +530,19 @@ class HostView:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's description of how this was made, None without it; its time limit is that of the settings."""
+        """Gymnasium's description of how this was made, None without it; its time limit is that of the settings.
+
+        Arguments that JSON cannot hold (paths, arrays, configurations) are in it as what makes the same environment.
+        """
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
         # Gymnasium sets it without a limit, because the limit is part of the environment and not of a wrapper
-        self._spec = spec and replace(spec, max_episode_steps=self.host.groups[0].max_steps)
+        if spec is not None:
+            kwargs = {name: json_form(value) for name, value in spec.kwargs.items()}
+            spec = replace(spec, max_episode_steps=self.host.groups[0].max_steps, kwargs=kwargs)
+        self._spec = spec
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -627,6 +637,18 @@ class SingleView(HostView):
     def close(self) -> None:
         """Free the renderer's window, and stop the live view; closing twice is fine."""
         self.host.close()
+
+
+def json_form(value: Any) -> Any:
+    """Return what JSON can hold instead of an argument of a view; a class of a task stays as it is."""
+    if isinstance(value, Enum):
+        return value.value
+    if callable(value):
+        return value
+    try:
+        return plain(value)
+    except ConfigError:
+        return str(value)  # a torch.device
 
 
 def limited(config: Limited, name: str, steps: int | None) -> Limited:

@@ -78,7 +78,7 @@ def load_config(
     merged = _merge(_own_defaults(cls, merged), merged)
     try:
         # as JSON, files, keywords and command lines are validated alike: a list may be a tuple, a string is no number
-        return cls.model_validate_json(json.dumps(_plain(merged)))
+        return cls.model_validate_json(json.dumps(plain(merged)))
     except ValidationError as error:
         given = set(_flat_keys(above))
         raise ConfigError(*(error_line(cls, item, path, given) for item in error.errors(include_url=False))) from None
@@ -349,7 +349,7 @@ def _flat_keys(nested: Mapping[str, Any], prefix: str = "") -> list[str]:
     return keys
 
 
-def _plain(value: Any, key: str = "") -> Any:
+def plain(value: Any, key: str = "") -> Any:
     """Return the JSON form of a value of a Python caller or of YAML, such as a NumPy array, a path or a model.
 
     Raises:
@@ -361,11 +361,11 @@ def _plain(value: Any, key: str = "") -> Any:
         for name in value:
             if not isinstance(name, str):
                 raise ConfigError(f"{key}.{name!r} is of type {type(name).__name__}; {_NAMES}")
-        return {name: _plain(item, f"{key}.{name}" if key else name) for name, item in value.items()}
+        return {name: plain(item, f"{key}.{name}" if key else name) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item, f"{key}.{index}") for index, item in enumerate(value)]
+        return [plain(item, f"{key}.{index}") for index, item in enumerate(value)]
     if isinstance(value, (np.generic, np.ndarray)):
-        return _plain(value.tolist(), key)
+        return plain(value.tolist(), key)
     if isinstance(value, Path):
         return str(value)
     if value is None or isinstance(value, (bool, int, float, str)):

@@ -31,6 +31,7 @@ from piavatar_envs.envs.state import (
     add_forces,
     check_arrays,
     check_settings,
+    file_digests,
     has_forces,
     settings_rows,
 )
@@ -69,6 +70,7 @@ class BatchEnv(EpisodeArrays):
         action_spec: the joints that act.
         action_map: from action components to joints, on the device.
         observer: writes the observation.
+        files: digests of the files that settings name.
         restarts: number of calls that made time jump: of :meth:`reset` and :meth:`set_state`.
     """
 
@@ -101,7 +103,7 @@ class BatchEnv(EpisodeArrays):
         max_steps = max(1, round(task.config.episode_seconds / task.config.physics.control_dt))
         super().__init__(simulation, self.observer.layout, self.action_spec.size, names, max_steps, seed)
         self.action_map = self.action_spec.upload(self.config.physics.control_dt, task.limits(), self.device)
-        self.restarts = 0
+        self.restarts, self.files = 0, file_digests(self.config)
         task.allocate_declared(self)
         task.allocate(self)
         self.observer.connect(self)
@@ -289,7 +291,7 @@ class BatchEnv(EpisodeArrays):
     def get_state(self) -> dict[str, np.ndarray]:
         """Copy everything that the future depends on to the host, the settings too."""
         state = {name: array.numpy().copy() for name, array in self.arrays().items()}
-        state[SETTINGS] = settings_rows(self.config, self.num_envs)
+        state[SETTINGS] = settings_rows(self.config, self.num_envs, self.files)
         for avatar in self.simulation.shapes.of_host:
             state[f"shape.{avatar}"] = self.simulation.flesh[avatar].shape_parameters.copy()
         return state
@@ -301,7 +303,7 @@ class BatchEnv(EpisodeArrays):
             ValueError: it was saved under other settings, or arrays are missing, unknown, or of the wrong shape or
                 type; nothing has changed then.
         """
-        check_settings(state, self.config)
+        check_settings(state, self.config, self.files)
         if has_forces(state):
             self.enable_forces()
         present = self.get_state()

@@ -6,8 +6,10 @@ part of it, as JSON in bytes, one row for each environment: a state can be split
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -92,26 +94,52 @@ def _check_finite(name: str, value: np.ndarray, failed: np.ndarray) -> None:
         raise ValueError(f"state[{name!r}]{list(first)} is {value[first]}, not finite; use what get_state() returned")
 
 
-def settings_rows(config: BaseModel, num_envs: int) -> np.ndarray:
-    """Encode the settings on which the future depends: JSON in UTF-8, ``(num_envs, length)`` uint8."""
+def file_digests(config: BaseModel) -> dict[str, str]:
+    """Return a digest of every file that a setting names by its path (a clip, a mesh), by the setting's dotted name."""
+
+    def files(value: Any, name: str) -> Iterator[tuple[str, Path]]:
+        if isinstance(value, (Mapping, list)):
+            for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
+                yield from files(item, f"{name}.{key}" if name else str(key))
+        elif isinstance(value, str) and (Path(value).suffix or "/" in value) and Path(value).is_file():
+            yield name, Path(value)
+
+    found = files(config.model_dump(mode="json"), "")
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in found}
+
+
+def settings_rows(config: BaseModel, num_envs: int, files: Mapping[str, str]) -> np.ndarray:
+    """Encode the settings on which the future depends, and the digests of their files.
+
+    Args:
+        config: the settings.
+        num_envs: number of environments.
+        files: of :func:`file_digests`, when the environment was built.
+
+    Returns:
+        JSON in UTF-8, ``(num_envs, length)`` uint8.
+    """
     kept = {name: value for name, value in config.model_dump(mode="json").items() if name not in _SHOWN}
+    if files:
+        kept["files"] = dict(files)
     text = json.dumps(_without_beginnings(kept), sort_keys=True, separators=(",", ":"))
     return np.tile(np.frombuffer(text.encode(), np.uint8), (num_envs, 1))
 
 
-def check_settings(state: Mapping[str, Any], config: BaseModel) -> None:
+def check_settings(state: Mapping[str, Any], config: BaseModel, files: Mapping[str, str]) -> None:
     """Refuse a state that was saved under settings that would change its future.
 
     Args:
         state: of any number of environments; one without settings passes here and is refused as incomplete.
         config: settings of the environment that is to continue from it.
+        files: digests of its files.
 
     Raises:
-        ValueError: a setting differs, or the settings cannot be read.
+        ValueError: a setting or the content of a file differs, or the settings cannot be read.
     """
     if SETTINGS not in state:
         return
-    saved, own = np.asarray(state[SETTINGS]), settings_rows(config, 1)
+    saved, own = np.asarray(state[SETTINGS]), settings_rows(config, 1, files)
     if saved.dtype != np.uint8 or saved.ndim != 2:
         raise ValueError(_unreadable(f"has shape {saved.shape} and type {saved.dtype}"))
     unlike = (saved != own).any(1) if saved.shape[1] == own.shape[1] else np.ones(len(saved), bool)

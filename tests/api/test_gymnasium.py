@@ -104,6 +104,12 @@ def test_the_spec_gives_the_time_limit_and_calls_can_shorten_it(device):
     for made in (single, vector):
         made.reset(seed=0)
         assert [np.all(made.step(np.zeros(made.action_space.shape, np.float32))[3]) for _ in range(2)] == [False, True]
+    given = {"config": {"target_radius": np.float32(0.25)}, "tone": np.float64(0.5), "device": device}
+    given |= {"scene.props": [{"name": "a", "position": np.array([1.0, 1.0, 1.0])}], "joints": None}
+    env = gymnasium.make("PIAvatar/Reach-v0", **given, fidelity="tiny")
+    read = gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json())
+    assert gymnasium.make(read).unwrapped.config == env.unwrapped.config
+    assert gymnasium.envs.registration.EnvSpec.from_json(vector.spec.to_json()).max_episode_steps == 2
     with pytest.raises(ValueError, match="max_episode_steps=0 "):
         gymnasium.make_vec(KICK, max_episode_steps=0, **settings)
 

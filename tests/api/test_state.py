@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 
 import numpy as np
@@ -182,6 +183,23 @@ def test_a_differing_setting_of_a_scene_is_named(make_env):
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"scene.props.0.mass=0.4.*0.5"):
         other.set_state(env.get_state())
+
+
+def test_states_from_before_a_file_was_replaced_are_refused(device, tmp_path):
+    path = tmp_path / "clip.txt"
+    made = []
+    for height in (0.8, 0.85):
+        frames = [[0.1, 0.0, height, 0.0, *(8 * [0.0])] + 32 * [0.0] for _ in range(3)]
+        for row in frames:
+            for start in (4, 8, 12, 16, 21, 25, 30, 35, 39):
+                row[start] = 1.0
+        path.write_text(json.dumps({"Loop": "none", "Frames": frames}))
+        made.append(AvatarEnv("TrackMotion-v0", device=device, fidelity="tiny", motion=str(path)))
+        made[-1].reset(seed=0)
+    first, second = made
+    first.set_state(first.get_state())
+    with pytest.raises(ValueError, match=r"files\.motion="):
+        second.set_state(first.get_state())
 
 
 def test_settings_that_do_not_alter_the_dynamics_may_differ(make_env, equal):
