@@ -464,7 +464,9 @@ class PropConfig(BaseModel):
     name: str = Field(..., min_length=1, description="its name in observations and settings")
     shape: Literal["sphere", "box", "capsule", "mesh"] = Field("sphere", description="its shape")
     size: tuple[Length, ...] = Field(
-        (0.11,), description="sphere: radius; box: half extents; capsule: radius, half length; mesh: scale [m]"
+        (0.11,),
+        description="sphere: radius; box: half extents; capsule: radius, half length; mesh: length of the file's unit, "
+        "1 if not given [m]",
     )
     file: str | None = Field(None, description="watertight mesh, for shape mesh")
     mass: float | None = Field(None, ge=1.0e-6, le=1.0e4, description="mass; null for that of the density [kg]")
@@ -498,6 +500,13 @@ class PropConfig(BaseModel):
         "enough [m/s]",
     )
     friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient on the ground and colliders [-]")
+
+    @model_validator(mode="after")
+    def _leave_a_mesh_its_size(self) -> PropConfig:
+        """Give a mesh the scale 1, where the default would be the radius of a ball."""
+        if self.shape == "mesh" and "size" not in self.model_fields_set:
+            object.__setattr__(self, "size", (1.0,))  # the model is frozen
+        return self
 
 
 class ColliderConfig(BaseModel):

@@ -235,7 +235,8 @@ def _particles(solid: _Solid, spacing: float) -> PropPoints:
     if len(places) < MIN_PARTICLES or abs(caught / solid.volume - 1.0) > MAX_MISSED:
         raise ValueError(
             f"{solid.name} is too thin for spacing={spacing:g} m: {len(places)} particles (at least {MIN_PARTICLES}) "
-            f"with {caught / solid.volume:.0%} of its volume; use a spacing under {0.5 * spacing:g} m or a larger shape"
+            f"with {caught / solid.volume:.0%} of its volume; use a larger size, or a finer physics.fidelity for a "
+            f"spacing under {0.5 * spacing:g} m"
         )
     rest = _stretched(places, share, solid.spread)
     beyond = solid.distance(rest) > 0.0
@@ -263,7 +264,8 @@ def _lattice(solid: _Solid, spacing: float) -> tuple[np.ndarray, np.ndarray, flo
         larger = spacing * (counts.prod() / MAX_CELLS) ** (1.0 / 3.0)
         raise ValueError(
             f"{solid.name} at spacing={spacing:g} m has {counts.prod():.3g} cells (at most {MAX_CELLS}); "
-            f"use a spacing above {larger:.2g} m"
+            f"use a smaller size, which of a mesh in millimetres is 0.001, or a coarser physics.fidelity for a spacing "
+            f"above {larger:.2g} m"
         )
     edge = (high - low) / counts
     cells = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3)

@@ -28,13 +28,15 @@ def prop_points(prop: PropConfig, spacing: float) -> PropPoints:
     """Fill a prop's solid with particles of this ``spacing`` [m].
 
     Raises:
-        ConfigError: the size does not fit the shape, a mesh has no file, or the solid is too thin.
+        ConfigError: the size or the file does not fit the shape, or the solid is too thin.
     """
     sizes = {"sphere": 1, "box": 3, "capsule": 2, "mesh": 1}
     if len(prop.size) != sizes[prop.shape]:
         raise ConfigError(
             f"prop {prop.name}: size={list(prop.size)} must be {sizes[prop.shape]} numbers for a {prop.shape}"
         )
+    if prop.file is not None and prop.shape != "mesh":
+        raise ConfigError(f"prop {prop.name}: file={prop.file!r} is for shape='mesh', not {prop.shape!r}")
     try:
         if prop.shape == "mesh":
             if prop.file is None:

@@ -12,11 +12,12 @@ from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.asset import mesh_volume
+from piavatar_envs.config import ConfigError, EnvConfig, PropConfig, load_config
 from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.types import Kinematic, Particles
 from piavatar_envs.sim import prop_geometry as geometry
-from piavatar_envs.sim.props import Prop, PropMatter, PropState, place_prop, scale_density, track_prop
+from piavatar_envs.sim.props import Prop, PropMatter, PropState, place_prop, prop_points, scale_density, track_prop
 
 #: Foreign particles before and after the prop, which nothing here may touch.
 BEFORE, AFTER = 5, 3
@@ -490,6 +491,24 @@ def test_bad_meshes_are_refused(trimesh, tmp_path, name):
     assert name in str(error.value)
     with pytest.raises(FileNotFoundError, match=r"none\.obj"):
         geometry.mesh(tmp_path / "none.obj", 0.05)
+
+
+def test_defaults_of_a_ball_are_not_those_of_a_mesh(trimesh, tmp_path):
+    path = str(tmp_path / "cube.stl")
+    trimesh.creation.box(extents=[0.4] * 3).export(path)
+    for given in (PropConfig(name="a", shape="mesh", file=path), made(shape="mesh", file=path)):
+        assert prop_points(given, 0.05).volume.sum() == pytest.approx(0.4**3, rel=1e-5)
+    assert prop_points(made(shape="mesh", file=path, size=[0.5]), 0.05).volume.sum() == pytest.approx(0.2**3, rel=1e-5)
+    assert made().size == (0.11,)
+    with pytest.raises(ConfigError, match=r"file=.*cube.stl' is for shape='mesh', not 'sphere'"):
+        prop_points(made(file=path), 0.05)
+    with pytest.raises(ConfigError, match=r"smaller size.* 0\.001, or a coarser physics\.fidelity"):
+        prop_points(made(shape="mesh", file=path, size=[100.0]), 0.01)
+
+
+def made(**settings) -> PropConfig:
+    """Return a prop as settings of an environment make it."""
+    return load_config(EnvConfig, None, {"scene": {"props": [{"name": "a", **settings}]}}).scene.props[0]
 
 
 def test_without_trimesh_the_error_names_the_extra(monkeypatch, tmp_path):
