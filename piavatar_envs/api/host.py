@@ -31,6 +31,8 @@ from piavatar_envs.sim.world import check_device
 
 #: Types in which settings are given.
 Settings = EnvConfig | Mapping[str, Any] | str | Path | None
+#: Substeps a control step above which an environment is worth a warning: several times those of the finest bodies.
+MANY_SUBSTEPS = 300
 Limited = TypeVar("Limited", bound=EnvConfig)
 
 
@@ -97,9 +99,21 @@ class EpisodeHost:
         first = self.groups[0]
         self.num_agents, self.layout, self.action_size = first.num_agents, first.layout, first.action_spec.size
         self.action_names: tuple[str, ...] = tuple(first.action_spec.names())
+        self._warn_of_many_substeps(first)
         self.ready, self.render_mode = False, render_mode
         self.pictures = Pictures(self.group_of, self.config.render)
         self.live = Live(first, self.apply_force, self.config.render.color) if render_mode == "human" else None
+
+    @staticmethod
+    def _warn_of_many_substeps(batch: BatchEnv) -> None:
+        """Warn of a control step that is slow because matter is stiff or fast, or the resolution fine."""
+        count, physics = batch.simulation.model.num_substeps, batch.config.physics
+        if count > MANY_SUBSTEPS:
+            gym.logger.warn(
+                f"a control step takes {count} substeps with physics.young_modulus={physics.young_modulus:g} Pa and "
+                f"fidelity={physics.fidelity!r}, and time in proportion; softer or slower matter, or a coarser "
+                "fidelity, needs fewer"
+            )
 
     @property
     def frame_rate(self) -> int:

@@ -91,6 +91,11 @@ def test_a_yaml_file_and_keywords_configure(tmp_path, device):
     assert env.metadata["render_fps"] == 50 and AvatarEnv.metadata["render_fps"] == 30
 
 
+def test_stiffness_that_makes_steps_slow_warns(device):
+    with pytest.warns(UserWarning, match=r"takes \d{3} substeps with physics\.young_modulus=1e\+09 Pa"):
+        AvatarEnv("Reach-v0", device=device, fidelity="tiny", young_modulus=1e9)
+
+
 def test_the_spec_gives_the_time_limit_and_calls_can_shorten_it(device):
     settings = {"device": device, "fidelity": "tiny"}
     env = gymnasium.make(KICK, episode_seconds=0.2, **settings)
