@@ -104,7 +104,6 @@ class Rig:
         self._struck = wp.zeros(n, dtype=int, device=device)
         self._reset, self._step, self._strike = LaunchGraph(device), LaunchGraph(device), LaunchGraph(device)
         self.avatar.record_reset(self._reset, self.state, self._placed)
-        self.controller.record_reset(self._reset, self.state, self._placed)
         self.avatar.record_tracking(self._reset, self.state)
         record_control_step(self._step, [self.avatar], [self.controller], self.model, self.state, self.scratch)
         self._strike.launch(

@@ -3,8 +3,7 @@
 :class:`~piavatar_envs.avatar.pose_control.controller.PoseController` moves the flesh along a commanded pose;
 :class:`~piavatar_envs.avatar.torque_control.controller.TorqueController` lets torques act between bones.
 
-Shape, root and flesh are pulled as by springs that are critically damped and integrated implicitly. Both controllers
-hold joints by the same springs.
+Shape, tone, root and flesh are pulled as by springs that are critically damped and integrated implicitly.
 """
 
 from __future__ import annotations
@@ -13,16 +12,10 @@ from typing import Protocol
 
 import warp as wp
 
-from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.avatar.rotation import quat_log
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.mpm.types import Scratch, State, row
+from piavatar_envs.mpm.types import Scratch, State
 
 wp.set_module_options({"enable_backward": False})
-
-
-_HEAD, _FOOT = wp.constant(joint_index("head")), wp.constant(joint_index("left_foot"))
 
 
 class Controller(Protocol):
@@ -79,22 +72,3 @@ def critical_pull(rate: float, dt: float, error: wp.vec3, v: wp.vec3):
 def implicit_velocity(rate: float, dt: float, displacement: wp.vec3, v: wp.vec3):
     """Return the velocity after ``dt`` of an implicit critically damped pull of natural frequency ``rate`` [1/s]."""
     return (1.0 / pull_denominator(rate, dt)) * (v + dt * rate * rate * displacement)
-
-
-@wp.func
-def body_size(body: Body, mass: float, e: int):
-    """Return mass times height of a body over those of the reference adult: the factor on springs and strength [-]."""
-    r = row(e, body.rest_joint.shape[0])
-    return body.per_size * mass * (body.rest_joint[r, _HEAD][2] - body.rest_joint[r, _FOOT][2])
-
-
-@wp.func
-def implicit_inertia(dt: float, stiffness: float, damping: float):
-    """Return ``A = dt D + dt^2 K``: the inertia of a spring and a damper, implicit in time."""
-    return dt * damping + dt * dt * stiffness
-
-
-@wp.func
-def spring_error(goal: wp.quat, local: wp.quat):
-    """Return the rotation vector from a local rotation to its goal, in the frame of the parent [rad]."""
-    return quat_log(goal * wp.quat_inverse(local))

@@ -248,16 +248,19 @@ def chunk_corrections(
     x: wp.array2d(dtype=wp.vec3),
     center: wp.array2d(dtype=wp.vec3),
     pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
     e: int,
     share: wp.vec4i,
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Sum the momentum of the pulls in one chunk, linear and angular about the bone's centre."""
+    """Sum the momenta of pulls and lean in one chunk, linear and angular about the bone's centre."""
     origin = center[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
     p1 = wp.vec3()
     l1 = wp.vec3()
+    p2 = wp.vec3()
+    l2 = wp.vec3()
     last = share[3] - 1
     n = share[2]
     while n <= last:
@@ -268,8 +271,11 @@ def chunk_corrections(
             a = w * vector_at(pull, e, p)
             p1 += a
             l1 += wp.cross(d, a)
+            a = w * vector_at(lean, e, p)
+            p2 += a
+            l2 += wp.cross(d, a)
             n += share[1] >> 8
-    total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
     store_one(corrections, e, share, total)
 
 
@@ -280,6 +286,7 @@ def sum_corrections(
     x: wp.array2d(dtype=wp.vec3),
     center: wp.array2d(dtype=wp.vec3),
     pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     threads: int,
     # out
@@ -289,7 +296,7 @@ def sum_corrections(
     i, j, k = wp.tid()
     e, share = own_share(body.quarters, i, j, k, threads)
     if failure[e] == 0:
-        chunk_corrections(body, particles, x, center, pull, e, share, corrections)
+        chunk_corrections(body, particles, x, center, pull, lean, e, share, corrections)
 
 
 @wp.func

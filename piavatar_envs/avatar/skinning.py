@@ -4,7 +4,7 @@ A particle is moved by up to four bones, and its skinning is packed into 16 byte
 reads it: weights add up to one, so the first is not stored. It is the same in all environments.
 
 For the pose controller a bone has one record of everything that particles blend in a substep. On a GPU a record is read
-in eight loads of 16 bytes, which dominate the cost of the pass. Therefore the step of a bone is stored as the rate of
+in eleven loads of 16 bytes, which dominate the cost of the pass. Therefore the step of a bone is stored as the rate of
 its turn, which the record has anyway, and a translation, not as a matrix of its own.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.types import Body, vec21, vec32
+from piavatar_envs.avatar.types import Body, vec24, vec44
 from piavatar_envs.core.arrays import vec8, vec12, vector_at
 from piavatar_envs.mpm.types import row
 
@@ -75,37 +75,38 @@ def weights_of(skin: wp.array(dtype=wp.vec4), p: int) -> wp.vec4:
     ...
 
 
-#: First indices of the parts of a record: rows of a matrix 3 x 4, the place; rows of the turn's rate, 3 x 3; the
+#: First indices of the parts of a record: rows of two matrices 3 x 4 (place, lean); rows of the turn's rate, 3 x 3; the
 #: translation that turns this rate, applied to a place, into its velocity; then the rigid motion of the bone, velocity
 #: at the pelvis' centre and spin.
-PLACE, TURN, STEP = wp.constant(0), wp.constant(12), wp.constant(21)
-VELOCITY, SPIN = wp.constant(24), wp.constant(27)
+PLACE, LEAN, TURN = wp.constant(0), wp.constant(12), wp.constant(24)
+STEP, VELOCITY, SPIN = wp.constant(33), wp.constant(36), wp.constant(39)
 #: First indices of the parts of a blended record.
-AT_PLACE, AT_STEP, AT_TURN = wp.constant(0), wp.constant(3), wp.constant(6)
-AT_VELOCITY, AT_SPIN = wp.constant(15), wp.constant(18)
+AT_PLACE, AT_LEAN, AT_STEP = wp.constant(0), wp.constant(3), wp.constant(6)
+AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
 
 
 @wp.func_native(
     READ
     + """
-wp::vec_t<21, wp::float32> sum;
+wp::vec_t<24, wp::float32> sum;
 const auto add = [&](const wp::float32* bone, wp::float32 w) {
     wp::float32 at[3];
 #pragma unroll
-    for (int i = 0; i < 3; ++i) {
+    for (int i = 0; i < 6; ++i) {  // place and lean
         const wp::float32* const row = bone + 4 * i;
-        at[i] = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
-        sum[i] += w * at[i];
+        const wp::float32 value = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
+        if (i < 3) at[i] = value;
+        sum[i] += w * value;
     }
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
-        const wp::float32* const turn = bone + 12 + 3 * i;
-        sum[3 + i] += w * (turn[0] * at[0] + turn[1] * at[1] + turn[2] * at[2] + bone[21 + i]);
+        const wp::float32* const turn = bone + 24 + 3 * i;
+        sum[6 + i] += w * (turn[0] * at[0] + turn[1] * at[1] + turn[2] * at[2] + bone[33 + i]);
     }
 #pragma unroll
-    for (int i = 0; i < 9; ++i) sum[6 + i] += w * bone[12 + i];
+    for (int i = 0; i < 9; ++i) sum[9 + i] += w * bone[24 + i];
 #pragma unroll
-    for (int i = 0; i < 6; ++i) sum[15 + i] += w * bone[24 + i];
+    for (int i = 0; i < 6; ++i) sum[18 + i] += w * bone[36 + i];
 };
 #if defined(__CUDA_ARCH__)
 const auto* const own = &wp::index(record, e, 0);
@@ -115,9 +116,9 @@ float4 w4 = make_float4(weights[0], weights[1], weights[2], weights[3]);
 for (int n = 0; n < 4; ++n) {
     if (w4.x > 0.0f) {
         const float4* const from = reinterpret_cast<const float4*>(own + (bones & 255u));
-        float4 bone[8];
+        float4 bone[11];
 #pragma unroll
-        for (int q = 0; q < 8; ++q) bone[q] = from[q];
+        for (int q = 0; q < 11; ++q) bone[q] = from[q];
         add(reinterpret_cast<const wp::float32*>(bone), w4.x);
     }
     bones >>= 8;
@@ -130,34 +131,30 @@ return sum;
 """
 )
 def blend_records(
-    record: wp.array2d(dtype=vec32),
+    record: wp.array2d(dtype=vec44),
     e: int,
     skin: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
-) -> vec21:
+) -> vec24:
     """Return the blend of the records of particle ``p``'s bones, with places and velocities evaluated at ``rest``."""
     ...
 
 
 @wp.func
-def blended_vector(s: vec21, first: int):
+def blended_vector(s: vec24, first: int):
     """Return the vector at ``first`` of a blended record."""
     return wp.vec3(s[first], s[first + 1], s[first + 2])
 
 
 @wp.func
-def blended_turn(s: vec21):
+def blended_turn(s: vec24):
     """Return the blended rate ``(dR - I) / dt`` of a substep's rotation [1/s]."""
-    turn = wp.mat33()
-    for i in range(3):
-        for j in range(3):
-            turn[i, j] = s[AT_TURN + 3 * i + j]
-    return turn
+    return wp.mat33(s[9], s[10], s[11], s[12], s[13], s[14], s[15], s[16], s[17])
 
 
 @wp.func
-def blended_velocity(s: vec21, arm: wp.vec3):
+def blended_velocity(s: vec24, arm: wp.vec3):
     """Return the velocity of the bones' blended rigid motion, ``arm`` from the pelvis' centre [m/s]."""
     return blended_vector(s, AT_VELOCITY) + wp.cross(blended_vector(s, AT_SPIN), arm)
 
@@ -166,12 +163,12 @@ def blended_velocity(s: vec21, arm: wp.vec3):
 #if defined(__CUDA_ARCH__)
 float4* const to = reinterpret_cast<float4*>(&wp::index(record, e, b));
 #pragma unroll
-for (int q = 0; q < 8; ++q) to[q] = make_float4(value[4 * q], value[4 * q + 1], value[4 * q + 2], value[4 * q + 3]);
+for (int q = 0; q < 11; ++q) to[q] = make_float4(value[4 * q], value[4 * q + 1], value[4 * q + 2], value[4 * q + 3]);
 #else
 wp::index(record, e, b) = value;
 #endif
 """)
-def store_record(record: wp.array2d(dtype=vec32), e: int, b: int, value: vec32):
+def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
     """Store ``record[e, b] = value``, 16 bytes at a time."""
     ...
 

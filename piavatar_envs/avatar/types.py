@@ -20,20 +20,20 @@ from piavatar_envs.core.structs import make_struct
 wp.set_module_options({"enable_backward": False})
 
 
+#: Tone 1 pulls bones to the commanded pose at this natural frequency [1/s].
+TONE_RATE = 30.0
 #: Natural frequency of the root wrench [1/s].
 ROOT_RATE = 10.0
 #: Decay of motion between bones at any tone [1/s]; without it a limp body rings like rubber.
 DAMPING = 3.0
-#: Share of a gap between two bones at their joint that closes within a control step, which measures it once.
-CLOSING = 0.3
 #: Meaning of a command to the pose controller, by the setting ``control.command``.
 COMMANDS = {"increment": 0, "target": 1, "reference": 2}
 COMMAND_TARGET = wp.constant(COMMANDS["target"])
 COMMAND_REFERENCE = wp.constant(COMMANDS["reference"])
 
 #: Record of a bone, and its blend at a particle, see :mod:`piavatar_envs.avatar.skinning`.
-vec32 = wp.types.vector(length=32, dtype=wp.float32)
-vec21 = wp.types.vector(length=21, dtype=wp.float32)
+vec44 = wp.types.vector(length=44, dtype=wp.float32)
+vec24 = wp.types.vector(length=24, dtype=wp.float32)
 
 
 @wp.struct
@@ -49,7 +49,6 @@ class Body:
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
     bone_mass: wp.array2d(dtype=float)  # (rows, bones) skinning-weighted mass [kg]
-    per_size: float  # height over the span from feet to head, over mass times height of the reference adult [1/(kg m)]
     parent: wp.array(dtype=int)  # (bones,)
     children: wp.array(dtype=int)  # (bones,) a bit for each bone that hangs on a bone
     depth: wp.array(dtype=int)  # (bones,) joints between a bone and the root
@@ -70,8 +69,7 @@ class Body:
 class PoseControl:
     """Parameters of the pose controller, named like the settings of ``control`` that they follow from.
 
-    Rates are natural frequencies of critically damped pulls [1/s]; springs, ``(bones,)``, are those of the
-    reference adult.
+    Rates are natural frequencies of critically damped pulls [1/s].
     """
 
     dt: float  # substep [s]
@@ -80,9 +78,7 @@ class PoseControl:
     command: int  # one of COMMANDS
     shape_rate: float  # physical shape preservation, alpha / control_dt
     kinematic_shape_rate: float  # the paper's shape preservation inside vk; breaks momentum
-    stiffness: wp.array(dtype=float)  # of the joints' springs, times tone [N m/rad]
-    spring_damping: wp.array(dtype=float)  # of the same [N m s/rad]
-    joint_rate: float  # rate at which a gap at a joint closes [1/s]
+    tone_rate: float  # pull towards the commanded pose, TONE_RATE tone
     damping: float  # decay of motion between bones [1/s]
     free_motion: int  # 1: commanded motion carries no net momentum (0: not until the root wrench is released)
     gravity: wp.vec3
@@ -141,6 +137,14 @@ class Carry:
 
 
 @wp.struct
+class Anchor:
+    """Rigid motion that aligns the commanded pose with the body; ``(num_envs,)``."""
+
+    rotation: wp.array(dtype=wp.quat)
+    translation: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
 class Command:
     """Commanded pose at the start of the control step, and its increment until the end."""
 
@@ -168,40 +172,6 @@ class RootState:
 
 
 @wp.struct
-class BoneMotion:
-    """Motion of the bones after the last substep, had only the controller changed it; ``(num_envs, bones)``."""
-
-    velocity: wp.array2d(dtype=wp.vec3)  # of the centre [m/s]
-    spin: wp.array2d(dtype=wp.vec3)  # [rad/s]
-
-
-@wp.struct
-class JointSolve:
-    """Joints in a substep of pose control, see :mod:`piavatar_envs.avatar.pose_control.joints`; ``(num_envs, bones)``.
-
-    Twists and wrenches are linear, then angular parts, in the world's axes at a joint. What crosses a joint is an
-    affine function of the change of twist of its parent at the parent's joint.
-    """
-
-    place: wp.array2d(dtype=wp.vec3)  # where the bone's own joint is [m]
-    closing: wp.array2d(dtype=wp.vec3)  # change of relative velocity that closes the gap at the joint [m/s]
-    push: wp.array2d(dtype=wp.vec3)  # angular impulse of the spring at the predicted spins [N m s]
-    resistance: wp.array2d(dtype=float)  # the same per change of relative spin, implicit in time [kg m^2]
-    # impulse on the parent: mass [kg], coupling [kg m] and inertia [kg m^2], with those at rest [N s, N m s]
-    mass: wp.array2d(dtype=wp.mat33)
-    coupling: wp.array2d(dtype=wp.mat33)
-    inertia: wp.array2d(dtype=wp.mat33)
-    linear: wp.array2d(dtype=wp.vec3)
-    angular: wp.array2d(dtype=wp.vec3)
-    # change of spin: inverse inertia, impulse, and the coupling that the velocity of the joint acts through
-    inverse: wp.array2d(dtype=wp.mat33)
-    impulse: wp.array2d(dtype=wp.vec3)
-    own_coupling: wp.array2d(dtype=wp.mat33)
-    velocity: wp.array2d(dtype=wp.vec3)  # change of the velocity of the joint [m/s]
-    spin: wp.array2d(dtype=wp.vec3)  # change of the spin [rad/s]
-
-
-@wp.struct
 class PoseWorkspace:
     """Arrays of the pose controller in a substep; ``now`` and ``after`` swap their roles every substep."""
 
@@ -213,18 +183,18 @@ class PoseWorkspace:
     tracked: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint positions at the start of the control step [m]
     now: Pose  # the kinematic pose at the substep's start
     after: Pose  # the same at its end
+    command_pose: Pose  # the commanded pose at the substep's start, before alignment
     carry: Carry
-    # (num_envs, bones) tracked joint positions less those at fixed offsets, in the bone's frame [m]
-    gap: wp.array2d(dtype=wp.vec3)
-    expected: BoneMotion
-    joints: JointSolve
+    anchor: Anchor
+    gap: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) tracked joint positions less those at fixed offsets [m]
     bones: RigidFits
     whole: RigidFit
     removed: RemovedMotion
     wrench: Wrench
     moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
-    record: wp.array2d(dtype=vec32)  # (num_envs, bones) records that particles blend
-    pull: wp.array2d(dtype=wp.vec3)  # (num_envs, count) velocity change by shape preservation [m/s]
+    record: wp.array2d(dtype=vec44)  # (num_envs, bones) records that particles blend
+    pull: wp.array2d(dtype=wp.vec3)  # (num_envs, count) velocity change by shape preservation and tone [m/s]
+    lean: wp.array2d(dtype=wp.vec3)  # (num_envs, count) displacement from the carried to the commanded pose [m]
     corrections: wp.array2d(dtype=vec12)  # (num_envs, chunks)
     bone_corrections: wp.array2d(dtype=vec12)  # (num_envs, bones) their sums
     change: wp.array2d(dtype=vec8)  # (num_envs, bones) correction field

@@ -187,8 +187,7 @@ class PoseControlConfig(BaseModel):
         1.0,
         ge=0.0,
         le=1.0,
-        description="stiffness of the springs that hold the joints against contact: 0 limp, 1 as stiff as those of "
-        "torque control; they have no greatest torque [-]",
+        description="how firmly joints return to the commanded pose after contact: 0 limp, 1 tensed [-]",
     )
     alpha: float = Field(0.3, ge=0.0, le=1.0, description="shape preservation, as a share of a control step [-]")
     shape_preservation: Literal["physical", "kinematic"] = Field(

@@ -15,12 +15,12 @@ import warp as wp
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
-from piavatar_envs.avatar.body.muscles import DAMPING_TIME, held_joints, make_muscles
+from piavatar_envs.avatar.body.muscles import make_muscles
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import TorqueControl
-from piavatar_envs.avatar.types import CLOSING, COMMANDS, DAMPING, ROOT_RATE, PoseControl
+from piavatar_envs.avatar.types import COMMANDS, DAMPING, ROOT_RATE, TONE_RATE, PoseControl
 from piavatar_envs.config import (
     AvatarConfig,
     AvatarSourceConfig,
@@ -270,12 +270,7 @@ def pose_control(settings: PoseControlConfig, model: Model) -> PoseControl:
     control.dt, control.control_dt, control.num_substeps = model.step.dt, model.control_dt, model.num_substeps
     control.command = COMMANDS[settings.command]
     control.shape_rate, control.kinematic_shape_rate = (rate, 0.0) if physical else (0.0, rate)
-    stiffness = settings.tone * held_joints(make_muscles().stiffness)
-    # an error is measured once a control step, and must not decay faster
-    springs = stiffness, max(DAMPING_TIME, model.control_dt) * stiffness
-    arrays = [wp.array(gains.astype(np.float32), dtype=float, device=model.device) for gains in springs]
-    control.stiffness, control.spring_damping = arrays
-    control.joint_rate, control.damping = CLOSING / model.control_dt, DAMPING
+    control.tone_rate, control.damping = TONE_RATE * settings.tone, DAMPING
     control.free_motion = int(settings.moves_freely)
     control.gravity = model.step.gravity
     control.root_rate = ROOT_RATE if settings.root == "wrench" else 0.0

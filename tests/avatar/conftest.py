@@ -289,7 +289,6 @@ def build_rig(
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
     reset_graph, step_graph = LaunchGraph(device), LaunchGraph(device)
     avatar.record_reset(reset_graph, state, mask)
-    controller.record_reset(reset_graph, state, mask)
     avatar.record_tracking(reset_graph, state)
     record_control_step(step_graph, [avatar], [controller], model, state, scratch)
     return Rig(model, state, scratch, points, avatar, controller, mask, reset_graph, step_graph).reset()

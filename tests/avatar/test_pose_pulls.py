@@ -1,21 +1,12 @@
-"""Shape preservation and joints of posed bodies: conservation laws, and what each is for."""
+"""The two pulls: shape preservation and tone. Conservation laws, and what each pull is for."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.muscles import (
-    DAMPING_TIME,
-    REFERENCE_HEIGHT,
-    REFERENCE_MASS,
-    held_joints,
-    make_muscles,
-)
-from piavatar_envs.avatar.body.skeleton import PARENTS, joint_index
-from piavatar_envs.mpm.colliders import Collider
-from tests.avatar.conftest import blended_rigid_part, mean_rigid_motion
+from piavatar_envs.avatar.body.skeleton import joint_index
+from tests.avatar.conftest import blended_rigid_part
 
 # ---- rigid fits
 
@@ -93,55 +84,12 @@ def test_kinematic_shape_preservation_undoes_alpha_of_the_error_a_step(make_rig)
     assert rig.shape_error().max() == pytest.approx(before * (1.0 - 0.3 / 12) ** 36, rel=0.03)
 
 
-def joint_motion(rig, x, u, command, tone):
-    """Return the change of velocity by the joints, in double precision: one linear system for bones and impulses.
-
-    It is that of the first substep, in which all of the motion counts as a change by contact and flesh.
-    """
-    dt, bones = rig.model.step.dt, range(1, 22)
-    rotation, place = rig.tracked_world()
-    fits = [mean_rigid_motion(rig.mass * rig.weights[:, b], x, u) for b in range(22)]
-    mass = rig.mass @ rig.weights
-    system, right = np.zeros((132 + 126, 132 + 126)), np.zeros(132 + 126)
-    size = rig.mass.sum() * np.ptp(rig.points.rest[0, :, 2]) / (REFERENCE_MASS * REFERENCE_HEIGHT)
-    stiffness = tone * size * held_joints(make_muscles().stiffness)
-    for b in range(22):
-        d = x - fits[b][0]
-        second = np.einsum("p,pi,pj->ij", rig.mass * rig.weights[:, b], d, d)
-        system[6 * b : 6 * b + 3, 6 * b : 6 * b + 3] = mass[b] * np.eye(3)
-        system[6 * b + 3 : 6 * b + 6, 6 * b + 3 : 6 * b + 6] = np.trace(second) * np.eye(3) - second
-    for b in bones:
-        a, rows = PARENTS[b], slice(132 + 6 * (b - 1), 132 + 6 * b)
-        relative = np.zeros((6, 132))  # velocity at the joint and spin, relative to the parent
-        for bone, sign in ((b, 1.0), (a, -1.0)):
-            arm = place[b] - fits[bone][0]
-            relative[:3, 6 * bone : 6 * bone + 3] = relative[3:, 6 * bone + 3 : 6 * bone + 6] = sign * np.eye(3)
-            relative[:3, 6 * bone + 3 : 6 * bone + 6] = sign * np.cross(np.eye(3), arm).T
-        motion = relative @ np.concatenate([np.concatenate(fit[1:]) for fit in fits])
-        local = Rotation.from_matrix(rotation[a].T @ rotation[b])
-        error = rotation[a] @ (Rotation.from_rotvec(command[b]) * local.inv()).as_rotvec()
-        resistance = (dt * DAMPING_TIME + dt**2) * stiffness[b]
-        system[:132, rows], system[rows, :132] = -relative.T, relative
-        system[rows.start + 3 : rows.stop, :132] *= resistance
-        system[rows.start + 3 : rows.stop, rows.start + 3 : rows.stop] = np.eye(3)
-        right[rows] = [*(-1.97 * motion[:3]), *(dt * stiffness[b] * error - 2.0 * resistance * motion[3:])]
-    change = np.linalg.solve(system, right)[:132].reshape(22, 2, 3)
-    return sum(
-        w[:, None] * (v + np.cross(s, x - fit[0])) for w, (v, s), fit in zip(rig.weights.T, change, fits, strict=True)
-    )
-
-
-@pytest.mark.parametrize("tone", [0.0, 0.5])
-def test_pulls_and_joints_give_back_bone_by_bone(make_rig, wild_pose, tone):
-    # The velocity after pull and joints, against the formulas in double precision. ``u += dl - fit_b(dl)`` with the
-    # implicit critically damped change ``dl`` of ``u - u_b``, the decay of motion between bones, and the rigid part of
-    # it all returned to the whole body.
+def test_the_pull_is_given_back_bone_by_bone(make_rig, wild_pose):
+    # The velocity after the pull, against the formula in double precision. ``u += dl - fit_b(dl)`` with the implicit
+    # critically damped change ``dl`` of ``u - u_b``, the decay of motion between bones, and the rigid part of it all
+    # returned to the whole body.
     rng = np.random.default_rng(1)
-    pose, command = wild_pose(rng), wild_pose(rng, 0.2)
-    rig = make_rig(root="free", tone=tone, alpha=0.6).reset(pose, root=(0.0, 0.0, 0.9))
-    command = (Rotation.from_rotvec(pose) * Rotation.from_rotvec(command)).as_rotvec()
-    rig.avatar.state.command_rotation.assign(rig.quaternions(command))
-    rig.command(command)
+    rig = make_rig(root="free", tone=0.0, alpha=0.6).reset(wild_pose(rng), root=(0.0, 0.0, 0.9))
     x, (count, dt) = rig.read("x"), (rig.points.num_points, rig.model.step.dt)
     place = x.copy()  # as tracked: only flesh is moved
     x = x + 0.02 * rng.normal(size=(count, 3)) * (rig.points.bone < 0)[:, None]
@@ -155,11 +103,9 @@ def test_pulls_and_joints_give_back_bone_by_bone(make_rig, wild_pose, tone):
     pull = (relative + dt * rate**2 * (place - x)) / (1.0 + 2.0 * rate * dt + (rate * dt) ** 2) - relative
     u_body = blended_rigid_part(np.ones((count, 1)), mass, x, u)
     change = pull - blended_rigid_part(weights, mass, x, pull) + (np.exp(-3.0 * dt) - 1.0) * (u_bone - u_body)
-    joints = joint_motion(rig, x, u, command, tone)
-    change += joints
     change -= blended_rigid_part(np.ones((count, 1)), mass, x, change)
-    assert np.abs(change - joints).max() > 0.1 and np.abs(joints).max() > 0.5
-    np.testing.assert_allclose(rig.read("u") - u, change, atol=3e-5 * np.abs(change).max())
+    assert np.abs(change).max() > 0.1
+    np.testing.assert_allclose(rig.read("u") - u, change, atol=2e-5)
 
 
 def test_a_dent_turns_with_the_body(make_rig):
@@ -212,7 +158,7 @@ def test_a_body_with_tone_returns_to_the_commanded_pose(recoils):
 def test_a_body_without_tone_stays_bent(recoils):
     errors = recoils[0]
     settled = {tone: e[-8:].mean() for tone, e in errors.items()}
-    assert settled[0.0] > 4.0
+    assert settled[0.0] > 8.0
     assert settled[0.0] > 5.0 * settled[0.3] > 5.0 * settled[1.0]
 
 
@@ -236,38 +182,25 @@ def test_tone_brings_a_torn_bone_back(make_rig):
     np.testing.assert_allclose(still.momentum, 0.0, atol=1e-5 * rig.mass.sum())
 
 
-@pytest.mark.parametrize(
-    ("half", "at", "steps", "expected"),
-    [
-        ((0.08, 0.05, 0.08), (0.17, -0.16, -0.083), 12, {"left_ankle": 0.1, "left_knee": 0.03}),
-        ((0.06, 0.06, 0.08), (0.47, -0.22, 0.93), 30, {"left_elbow": 0.03}),
-    ],
-    ids=["foot", "hand"],
-)
-def test_a_joint_resists_contact_with_the_stiffness_of_its_muscles(make_rig, half, at, steps, expected):
-    # A smooth box rises under forefoot or hand and stops: the moment about a joint, of contact and of the root's
-    # acceleration of the flesh beyond, over the joint's angle. A foot is so light that a damper would hide its spring.
-    rig = make_rig(colliders=[Collider("box", half, at, velocity=(0.0, 0.0, 0.05))])
-    rig.step(steps)
-    rig.model.boundaries.velocity.zero_()
-    rig.step(20)
-    sensors, wrench, x = rig.scratch.sensors, rig.controller.workspace.wrench, rig.read("x")
-    force, moment = (
-        a.numpy()[0, 0].astype(float) / rig.model.control_dt
-        for a in (sensors.boundary_impulse, sensors.boundary_moment)
-    )
-    field = wrench.linear.numpy()[0] + np.cross(wrench.angular.numpy()[0], x - rig.rigid_motion()[0])
-    size = rig.mass.sum() * np.ptp(rig.points.rest[0, :, 2]) / (REFERENCE_MASS * REFERENCE_HEIGHT)
-    assert force[2] > 10.0
-    for name, tolerance in expected.items():
-        joint = joint_index(name)
-        place = rig.tracked_world()[1][joint]
-        beyond = rig.mass * rig.weights[:, [b for b in range(22) if hangs_on(b, joint)]].sum(1)
-        total = moment - np.cross(place, force) + np.cross(x - place, beyond[:, None] * field).sum(0)
-        stiffness = np.linalg.norm(total) / rig.joint_errors()[joint - 1]
-        assert stiffness == pytest.approx(size * make_muscles().stiffness[joint], rel=tolerance), name
-
-
-def hangs_on(bone: int, joint: int) -> bool:
-    """Return whether a bone is moved by a joint."""
-    return bone == joint or (bone > joint and hangs_on(PARENTS[bone], joint))
+@pytest.mark.parametrize("tone", [0.5, 1.0])
+def test_tone_pulls_at_its_natural_frequency(make_rig, tone):
+    # A pose error without velocity closes like an oscillator of frequency ``w = 30 tone`` with damping ``2 w + 3``. In
+    # closed form ``(b exp(-a t) - a exp(-b t)) / (b - a)`` with ``a + b = 2 w + 3`` and ``a b = w^2``. Without stress,
+    # so that elasticity does not help, and at the hip, whose bones are many grid cells wide.
+    rig = make_rig(root="free", decoupling="no_stress", num_substeps=30, tone=tone)
+    hip = joint_index("left_hip")
+    command = np.zeros((22, 3))
+    command[hip, 0] = 0.1
+    rig.avatar.state.command_rotation.assign(rig.quaternions(command))
+    rig.command(command)
+    errors = [rig.joint_errors()[hip - 1]]
+    for _ in range(4):
+        rig.step()
+        errors.append(rig.joint_errors()[hip - 1])
+    t, w = np.arange(5) / 30.0, 30.0 * tone
+    middle = w + 1.5
+    spread = np.sqrt(middle**2 - w**2)
+    a, b = middle - spread, middle + spread
+    expected = (b * np.exp(-a * t) - a * np.exp(-b * t)) / (b - a)
+    np.testing.assert_allclose(np.array(errors) / 0.1, expected, atol=0.04)
+    assert expected[-1] < 0.5

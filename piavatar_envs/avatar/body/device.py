@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body.muscles import REFERENCE_HEIGHT, REFERENCE_MASS
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.segment_sums import PARTITION_SIZE, Partitions, share_chunks
 from piavatar_envs.avatar.skinning import in_order, pack
 from piavatar_envs.avatar.types import Body
@@ -129,9 +128,6 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)
     body.bone_mass = upload(bone_mass, float)
-    # height over the span from foot to head joint, in the first body
-    span = float(points.joints[0, joint_index("head"), 2] - points.joints[0, joint_index("left_foot"), 2])
-    body.per_size = float(np.ptp(points.rest[0, :, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
     depths = _joint_depths()
     body.parent, body.depth, body.levels = upload(PARENTS, int), upload(depths, int), max(depths) + 1
     body.level_start = upload(np.searchsorted(depths, np.arange(body.levels + 1)), int)  # they are in order

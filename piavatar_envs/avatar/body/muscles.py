@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, Bounds, joint_index, joint_limits, left_and_right
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, Bounds, joint_limits, left_and_right
 
 REFERENCE_MASS = 75.0  # [kg]
 REFERENCE_HEIGHT = 1.75  # [m]
@@ -129,14 +129,6 @@ def make_muscles(stiffness: float = 1.0, damping: float = 1.0, strength: float =
         range_lower=range_lower - SLACK,
         range_upper=range_upper + SLACK,
     )
-
-
-def held_joints(joints: np.ndarray) -> np.ndarray:
-    """Return gains of springs ``(22,)`` with those of locked joints, which a spring must hold, as of their parents."""
-    held = joints.copy()
-    for name in LOCKED_JOINTS:
-        held[joint_index(name)] = joints[PARENTS[joint_index(name)]]
-    return held
 
 
 def spring_rows(joints: np.ndarray) -> np.ndarray:

@@ -10,17 +10,19 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log, rigid_matrix, turn_about_z
-from piavatar_envs.avatar.skinning import PLACE, SPIN, STEP, TURN, VELOCITY, store_record
+from piavatar_envs.avatar.skinning import LEAN, PLACE, SPIN, STEP, TURN, VELOCITY, store_record
 from piavatar_envs.avatar.types import (
     COMMAND_REFERENCE,
     COMMAND_TARGET,
+    Anchor,
     Body,
     Carry,
     Pose,
     PoseControl,
     RemovedMotion,
+    RigidFit,
     RigidFits,
-    vec32,
+    vec44,
 )
 from piavatar_envs.mpm.types import row
 
@@ -121,6 +123,23 @@ def carry_bone(
 
 
 @wp.func
+def carry_anchor(
+    dt: float,
+    whole: RigidFit,
+    removed: RemovedMotion,
+    e: int,
+    # in and out
+    anchor: Anchor,
+):
+    """Advance the alignment of the command by the body's own motion."""
+    q, t = carried(
+        e, dt, removed, whole.center[e], whole.velocity[e], whole.spin[e], anchor.rotation[e], anchor.translation[e]
+    )
+    anchor.rotation[e] = q
+    anchor.translation[e] = t
+
+
+@wp.func
 def carried_bone(pose: Pose, carry: Carry, e: int, b: int):
     """Return the rotation of a bone in a pose and the position of its joint, carried by contact."""
     G = carry.rotation[e, b]
@@ -135,24 +154,37 @@ def write_record(
     next_pose: Pose,
     carry: Carry,
     bones: RigidFits,
+    command: Pose,
+    anchor: Anchor,
+    gap: wp.array2d(dtype=wp.vec3),
     e: int,
     b: int,
     # out
-    record: wp.array2d(dtype=vec32),
+    record: wp.array2d(dtype=vec44),
 ):
-    """Write the record of a bone that particles blend: its place, step, turn and physical motion."""
+    """Write the record of a bone that particles blend: its place, step, turn, physical motion and lean.
+
+    The lean leads from the carried to the commanded bone, which the anchor aligns with the body. The kinematic pose has
+    fixed offsets between joints, so for a bone that contact has moved off its joint the tracked gap is subtracted.
+    """
     q, at = carried_bone(pose, carry, e, b)
     q_next, at_next = carried_bone(next_pose, carry, e, b)
     rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
     A = rigid_matrix(q, rest, at)
     turn = finite_turn(quat_log(q_next * wp.quat_inverse(q)) / control.dt, control.dt)
     step = (at_next - at) / control.dt - turn * at
+    lean = wp.mat44()
+    if control.tone_rate > 0.0:
+        goal = wp.quat_rotate(anchor.rotation[e], command.position[e, b]) + anchor.translation[e]
+        back = wp.quat_rotate(carry.rotation[e, b], gap[e, b])
+        lean = rigid_matrix(anchor.rotation[e] * command.rotation[e, b], rest, goal - back) - A
     spin = bones.spin[e, b]
     velocity = bones.velocity[e, b] - wp.cross(spin, bones.center[e, b] - bones.center[e, 0])
-    s = vec32()
+    s = vec44()
     for i in range(3):
         for j in range(4):
             s[PLACE + 4 * i + j] = A[i, j]
+            s[LEAN + 4 * i + j] = lean[i, j]
         for j in range(3):
             s[TURN + 3 * i + j] = turn[i, j]
         s[STEP + i] = step[i]

@@ -79,6 +79,7 @@ class PoseController:
             moments=chunks,
             corrections=chunks,
             pull=avatar.num_points,
+            lean=avatar.num_points,
         )
         self.motion = wp.zeros((n, avatar.num_points), dtype=wp.vec3, device=model.device)
         w = self.workspace
@@ -89,9 +90,8 @@ class PoseController:
         self._bone_from, self._bone_step = (wp.zeros(matrices, dtype=wp.mat44, device=model.device) for _ in range(2))
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
-        """Append the reset of the masked environments' motions; a control step begins from the tracked pose."""
-        for vectors in (self.motion, self.workspace.expected.velocity, self.workspace.expected.spin):
-            graph.launch(reset_vectors, vectors.shape, [mask], [vectors])
+        """Append the reset of the masked environments' :attr:`motion`; a control step begins from the tracked pose."""
+        graph.launch(reset_vectors, self.motion.shape, [mask], [self.motion])
 
     def record_begin(self, graph: LaunchGraph) -> None:
         """Append the start of a control step: the increments from the tracked pose towards the goal."""
@@ -137,14 +137,14 @@ class PoseController:
         graph.launch(prepare_body, (n, block), inputs, [w, root], block_dim=block)
 
         inputs = [body, parameters, state.x, w.record, w.bones, released, failure]
-        outputs = [state.u, self.motion, state.kinematic, w.pull]
+        outputs = [state.u, self.motion, state.kinematic, w.pull, w.lean]
         graph.launch(command_particles, points, inputs, outputs, block_dim=BLOCK)
         if parameters.free_motion or parameters.root_rate > 0.0:  # a released root leaves an unsupported body
             inputs = [body, parameters, particles, state.x, state.vk, w.bones.center, released, failure, threads]
             graph.launch(sum_motion, (n, int(GROUPS), threads), inputs, [w.corrections], block_dim=BLOCK)
             graph.launch(remove_motions, (n, threads), [body, parameters, failure, threads], [w, root], block_dim=BLOCK)
 
-        inputs = [body, particles, state.x, w.bones.center, w.pull, failure, threads]
+        inputs = [body, particles, state.x, w.bones.center, w.pull, w.lean, failure, threads]
         graph.launch(sum_corrections, chunks, inputs, [w.corrections], block_dim=BLOCK)
         if many_chunks:
             graph.launch(add_to_bones, bones, [body, failure, threads], [w], block_dim=threads)
@@ -174,7 +174,4 @@ class PoseController:
 
     def arrays(self) -> dict[str, wp.array]:
         """Return the arrays of a checkpoint, by name."""
-        if self._injects:
-            return {}
-        expected = self.workspace.expected
-        return {"motion": self.motion, "expected_velocity": expected.velocity, "expected_spin": expected.spin}
+        return {} if self._injects else {"motion": self.motion}

@@ -1,15 +1,15 @@
 """One substep of the pose controller, before the MPM substep: from the particles' moments to their new velocities.
 
-In order: fit rigid motions to the physical velocity, pose the bones and carry them by these motions, hold the root and
-the joints, write the kinematic velocity of every particle and pull its shape, take the rigid part out of the commanded
-motion of unsupported bodies, return the momentum of the pulls to the bones, and move these as their joints say.
+In order: fit rigid motions to the physical velocity, pose the bones and carry them by these motions, hold the root,
+write the kinematic velocity of every particle and pull its shape and pose, take the rigid part out of the commanded
+motion of unsupported bodies, and return the momentum of the pulls to the bones.
 
-Two things act on the physical velocity, both implicit in time and both without net momentum:
+Two critically damped pulls act on the physical velocity, both implicit in time and both without net momentum:
 
-- *shape preservation* (``alpha``): a critically damped pull of a particle towards its skinned place on the carried
-  bones. It acts only on the motion relative to the bones, and its momentum is returned bone by bone.
-- *joints*, see :mod:`.joints`: springs between bones, ``tone`` times as stiff as those of torque control. A body of
-  tone 0 yields and keeps its bent joints; a body of tone 1 recoils and returns.
+- *shape preservation* (``alpha``): of a particle towards its skinned place on the carried bones. It acts only on the
+  motion relative to the bones, and its momentum is returned bone by bone.
+- *tone*: of the bones towards the commanded pose, relative to the body's own rigid motion. A body of tone 0 yields and
+  keeps its bent joints; a body of tone 1 recoils and returns.
 
 On a CPU :func:`command_body` runs all stages, one body after the other. On a GPU the passes over particles are
 launches of their own, because a CUDA block that ran all stages would wait in each pass for its last thread; the work on
@@ -21,13 +21,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.controller import implicit_velocity
+from piavatar_envs.avatar.controller import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.kinematics import pose_bones
-from piavatar_envs.avatar.pose_control.bones import carry_bone, write_record
-from piavatar_envs.avatar.pose_control.joints import joint_change, solve_joints
-from piavatar_envs.avatar.pose_control.root import axial, free_motion, hold_root, is_free
+from piavatar_envs.avatar.pose_control.bones import carry_anchor, carry_bone, write_record
+from piavatar_envs.avatar.pose_control.root import axial, free_motion, hold_root, is_free, lay_command
 from piavatar_envs.avatar.segment_sums import add_chunks, chunk_corrections, chunk_moments, chunk_motion, share_of
 from piavatar_envs.avatar.skinning import (
+    AT_LEAN,
     AT_PLACE,
     AT_STEP,
     blend_changes,
@@ -40,8 +40,6 @@ from piavatar_envs.avatar.skinning import (
 from piavatar_envs.avatar.tracking import fit_bone, fit_whole, spin_of
 from piavatar_envs.avatar.types import (
     Body,
-    BoneMotion,
-    JointSolve,
     PoseControl,
     PoseWorkspace,
     RemovedMotion,
@@ -49,7 +47,7 @@ from piavatar_envs.avatar.types import (
     RigidFits,
     RootState,
     Wrench,
-    vec32,
+    vec44,
 )
 from piavatar_envs.core.arrays import number_at, store_pair, store_vector, vec8, vec12, vector_at
 from piavatar_envs.core.cuda_intrinsics import (
@@ -106,18 +104,19 @@ def command_body(
     for c in range(chunks):
         chunk_moments(body, particles, x, u, w.tracked, e, share_of(body.quarters, c, 0), w.moments)
     pose_end(body, control, step, w, e, 0, 1)
+    pose_command(body, control, step, w, e, 0, 1)
     fit_motion(body, control, step, 1, w, e, 0, 1)
-    mass = body_mass[row(e, body_mass.shape[0])]
-    write_records(body, control, w, e, 0, 1)
-    hold_body(control, step, mass, w, root, e)
-    hold_joints(body, control, step, mass, w, e, 0, 1)
+    write_records(body, control, step, w, e, 0, 1)
+    hold_body(control, step, body_mass[row(e, body_mass.shape[0])], w, root, e)
     free = is_free(control, root.released[e])
     released = root.released[e] != 0
     center = w.bones.center[e, 0]
     for p in range(body.count):
         at = vector_at(x, e, body.first + p)
         before = vector_at(u, e, body.first + p)
-        command_particle(body, control, at, before, w.record, center, released, e, p, u, motion, kinematic, w.pull)
+        command_particle(
+            body, control, at, before, w.record, center, released, e, p, u, motion, kinematic, w.pull, w.lean
+        )
     if free:
         for c in range(chunks):
             share = share_of(body.quarters, c, 0)
@@ -125,7 +124,7 @@ def command_body(
     remove_motion(body, control, w, root, e, 0, 1)
     for c in range(chunks):
         share = share_of(body.quarters, c, 0)
-        chunk_corrections(body, particles, x, w.bones.center, w.pull, e, share, w.corrections)
+        chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, e, share, w.corrections)
     correct_bones(body, control, 1, w, e, 0, 1)
     for p in range(body.count):
         at = vector_at(x, e, body.first + p)
@@ -143,6 +142,17 @@ def pose_end(body: Body, control: PoseControl, step: int, w: PoseWorkspace, e: i
     )  # fmt: skip
 
 
+@wp.func
+def pose_command(body: Body, control: PoseControl, step: int, w: PoseWorkspace, e: int, thread: int, threads: int):
+    """Pose the bones as commanded at the start of substep ``step``, if tone is on."""
+    if control.tone_rate > 0.0:
+        fraction = float(step) / float(control.num_substeps)
+        pose_bones(
+            body, fraction, w.command.rotation, w.command.root, w.command.increment, w.root_increment, e, thread,
+            threads, w.command_pose.rotation, w.command_pose.position,
+        )  # fmt: skip
+
+
 @wp.kernel
 def fit_bones(body: Body, failure: wp.array(dtype=int), threads: int, w: PoseWorkspace):
     """Fit the rigid motion of every bone of bodies with many chunks, over ``(num_envs, bones, threads)``."""
@@ -155,10 +165,10 @@ def fit_bones(body: Body, failure: wp.array(dtype=int), threads: int, w: PoseWor
 def fit_motion(
     body: Body, control: PoseControl, step: int, chunk_threads: int, w: PoseWorkspace, e: int, thread: int, threads: int
 ):
-    """Fit the motion of bones and body from the chunks' moments, and carry the bones by the last substep's motion.
+    """Fit the motion of bones and body from the chunks' moments, and carry them by the last substep's motion.
 
     ``chunk_threads`` threads share a bone's chunks; 0: the bones have been fitted, see :func:`fit_bones`. At the
-    beginning of a control step contact has carried nothing yet, and the gaps at the joints are those tracked.
+    beginning of a control step contact has carried nothing yet.
     """
     if chunk_threads > 0:
         for b in range(thread // chunk_threads, body.parent.shape[0], threads // chunk_threads):
@@ -166,18 +176,26 @@ def fit_motion(
         sync_threads(threads)
     fit_whole(body, w.bones, e, thread, threads, w.whole)
     sync_threads(threads)
-    for b in range(thread, body.parent.shape[0], threads):
-        if step > 0:
+    if step > 0:
+        for b in range(thread, body.parent.shape[0], threads):
             carry_bone(control.dt, w.bones, w.removed, e, b, w.carry)
-        else:
-            w.gap[e, b] = wp.quat_rotate_inv(w.now.rotation[e, b], w.tracked[e, b] - w.now.position[e, b])
+        if thread == 0:
+            carry_anchor(control.dt, w.whole, w.removed, e, w.anchor)
 
 
 @wp.func
-def write_records(body: Body, control: PoseControl, w: PoseWorkspace, e: int, thread: int, threads: int):
-    """Write the records that particles blend, from the bones' motion and both poses."""
+def write_records(body: Body, control: PoseControl, step: int, w: PoseWorkspace, e: int, thread: int, threads: int):
+    """Write the records that particles blend, from the bones' motion and both poses.
+
+    At the beginning of a control step the command is aligned with the body.
+    """
+    if step == 0 and control.tone_rate > 0.0:
+        lay_command(body, w.command_pose, w.now, e, thread, threads, w.anchor)
+        for b in range(thread, body.parent.shape[0], threads):
+            w.gap[e, b] = w.tracked[e, b] - w.now.position[e, b]
+    sync_threads(threads)
     for b in range(thread, body.parent.shape[0], threads):
-        write_record(body, control, w.now, w.after, w.carry, w.bones, e, b, w.record)
+        write_record(body, control, w.now, w.after, w.carry, w.bones, w.command_pose, w.anchor, w.gap, e, b, w.record)
 
 
 @wp.func
@@ -185,18 +203,6 @@ def hold_body(control: PoseControl, step: int, mass: float, w: PoseWorkspace, ro
     """Compute the root wrench of a substep."""
     fraction = float(step) / float(control.num_substeps)
     hold_root(control, fraction, w.command, w.now, w.carry, w.whole, mass, e, root, w.wrench)
-
-
-@wp.func
-def hold_joints(
-    body: Body, control: PoseControl, step: int, mass: float, w: PoseWorkspace, e: int, thread: int, threads: int
-):
-    """Compute the change of the bones' motion by their joints in a substep."""
-    fraction = float(step) / float(control.num_substeps)
-    solve_joints(
-        body, control, fraction, mass, w.command, w.now, w.carry, w.gap, w.bones, w.expected, e, thread, threads,
-        w.joints,
-    )  # fmt: skip
 
 
 @wp.kernel(launch_bounds=(int(WARP) * PREPARING, BODIES_PREPARED))
@@ -230,14 +236,13 @@ def prepare_body(
         fit_motion(body, control, step, chunk_threads, w, e, thread, threads)
     if warp == 1 % warps:
         pose_end(body, control, step, w, e, thread, threads)
-    sync_block()
-    mass = body_mass[row(e, body_mass.shape[0])]
-    if warp == 0:
-        write_records(body, control, w, e, thread, threads)
-    if warp == 1 % warps and thread == 0:
-        hold_body(control, step, mass, w, root, e)
     if warp == 2 % warps:
-        hold_joints(body, control, step, mass, w, e, thread, threads)
+        pose_command(body, control, step, w, e, thread, threads)
+    sync_block()
+    if warp == 0:
+        write_records(body, control, step, w, e, thread, threads)
+    if warp == 1 % warps and thread == 0:
+        hold_body(control, step, body_mass[row(e, body_mass.shape[0])], w, root, e)
 
 
 @wp.func
@@ -246,7 +251,7 @@ def command_particle(
     control: PoseControl,
     at: wp.vec3,
     before: wp.vec3,
-    record: wp.array2d(dtype=vec32),
+    record: wp.array2d(dtype=vec44),
     center: wp.vec3,
     released: bool,
     e: int,
@@ -257,8 +262,9 @@ def command_particle(
     # out
     kinematic: Kinematic,
     pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
 ):
-    """Write the kinematic velocity of a particle, and its pull [m/s].
+    """Write the kinematic velocity of a particle, its pull [m/s] and its displacement to the commanded pose [m].
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
     that contact has caused along with the bone. Flesh with a velocity lag misses its share of every change of that
@@ -275,13 +281,15 @@ def command_particle(
     k -= control.kinematic_shape_rate * displacement
     relative = before - blended_velocity(s, at - center)
     pulled = implicit_velocity(control.shape_rate, control.dt, -displacement, relative) - relative
+    way = blended_vector(s, AT_LEAN)
     if velocity_lag > 0.0:
         # a body that nothing supports could not take the reaction
         if control.free_motion == 0 and not released:
             u[e, body.first + p] = before - velocity_lag * (k - motion[e, p])
         motion[e, p] = k
+    pulled += pull_gain(control.tone_rate, control.dt) * way
     store_pair(kinematic.vk, kinematic.spin, e, body.first + p, k, -0.5 * axial(turn), True, True)
-    store_vector(pull, e, p, pulled, True)
+    store_pair(pull, lean, e, p, pulled, way, control.tone_rate > 0.0, True)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 6))
@@ -289,7 +297,7 @@ def command_particles(
     body: Body,
     control: PoseControl,
     x: wp.array2d(dtype=wp.vec3),
-    record: wp.array2d(dtype=vec32),
+    record: wp.array2d(dtype=vec44),
     bones: RigidFits,
     released: wp.array(dtype=int),
     failure: wp.array(dtype=int),
@@ -299,6 +307,7 @@ def command_particles(
     # out
     kinematic: Kinematic,
     pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
 ):
     """Run :func:`command_particle` for every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
@@ -320,7 +329,7 @@ def command_particles(
         n = wp.min(p + threads, last)
         following = vector_at(x, e, body.first + n)
         following_u = vector_at(u, e, body.first + n)
-        command_particle(body, control, at, before, record, center, gone, e, p, u, motion, kinematic, pull)
+        command_particle(body, control, at, before, record, center, gone, e, p, u, motion, kinematic, pull, lean)
         p += threads
 
 
@@ -374,7 +383,6 @@ def blend_corrections(
     control: PoseControl,
     corrections: wp.array2d(dtype=vec12),
     bones: RigidFits,
-    joints: JointSolve,
     whole: RigidFit,
     wrench: Wrench,
     e: int,
@@ -382,15 +390,15 @@ def blend_corrections(
     threads: int,
     # out
     change: wp.array2d(dtype=vec8),
-    expected: BoneMotion,
 ):
-    """Compute the change of every bone's rigid motion, and the motion that is expected of it.
+    """Compute the change of every bone's rigid motion.
 
-    It returns the momentum of the shape pull, and adds joints, damping of motion between bones and the root wrench.
+    It returns the momentum of the shape pull, and adds tone, damping of motion between bones and the root wrench.
     """
     r = row(e, body.bone_mass.shape[0])
     dt = control.dt
-    decay = wp.exp(-control.damping * dt) - 1.0
+    gain = pull_gain(control.tone_rate, dt)
+    keep = 1.0 / pull_denominator(control.tone_rate, dt) - 1.0 + (wp.exp(-control.damping * dt) - 1.0)
     m = float(0.0)
     P = wp.vec3()
     L = wp.vec3()
@@ -400,11 +408,10 @@ def blend_corrections(
         l1 = wp.vec3(s[3], s[4], s[5])
         arm = bones.center[e, b] - whole.center[e]
         mass = wp.max(body.bone_mass[r, b], 1.0e-12)
-        own = joint_change(bones, joints, e, b)
-        dv = wp.vec3(own[0], own[1], own[2]) - p1 / mass
-        dv += decay * (bones.velocity[e, b] - whole.velocity[e] - wp.cross(whole.spin[e], arm))
-        dw = wp.vec3(own[3], own[4], own[5]) - spin_of(bones.inertia[e, b], l1)
-        dw += decay * (bones.spin[e, b] - whole.spin[e])
+        dv = -(p1 - gain * wp.vec3(s[6], s[7], s[8])) / mass
+        dv += keep * (bones.velocity[e, b] - whole.velocity[e] - wp.cross(whole.spin[e], arm))
+        dw = -spin_of(bones.inertia[e, b], l1 - gain * wp.vec3(s[9], s[10], s[11]))
+        dw += keep * (bones.spin[e, b] - whole.spin[e])
         change[e, b] = bone_change(dv, dw, bones.center[e, 0] - bones.center[e, b])
         p = mass * dv + p1
         m += mass
@@ -416,10 +423,7 @@ def blend_corrections(
     W = dt * wrench.angular[e] - spin_of(whole.inertia[e], wp.vec3(total[4], total[5], total[6]))
     rigid = bone_change(V, W, bones.center[e, 0] - whole.center[e])
     for b in range(thread, body.parent.shape[0], threads):
-        own = change[e, b] + rigid
-        change[e, b] = own
-        expected.velocity[e, b] = bones.velocity[e, b] + motion_at(own, bones.center[e, b] - bones.center[e, 0])
-        expected.spin[e, b] = bones.spin[e, b] + wp.vec3(own[3], own[4], own[5])
+        change[e, b] = change[e, b] + rigid
 
 
 @wp.func
@@ -431,10 +435,7 @@ def correct_bones(
         for b in range(thread // chunk_threads, body.parent.shape[0], threads // chunk_threads):
             add_chunks(body, w.corrections, e, b, thread % chunk_threads, chunk_threads, w.bone_corrections)
         sync_threads(threads)
-    blend_corrections(
-        body, control, w.bone_corrections, w.bones, w.joints, w.whole, w.wrench, e, thread, threads,
-        w.change, w.expected,
-    )  # fmt: skip
+    blend_corrections(body, control, w.bone_corrections, w.bones, w.whole, w.wrench, e, thread, threads, w.change)
 
 
 @wp.kernel(launch_bounds=(int(WARP), BODIES_AT_ONCE))

@@ -1,4 +1,4 @@
-"""Root of a posed avatar: a bounded wrench in place of balance, and motion of unsupported bodies.
+"""Root of a posed avatar: a bounded wrench in place of balance, alignment of the command, and unsupported bodies.
 
 A pose-controlled avatar does not balance itself; a six-degree-of-freedom wrench holds the commanded root instead. It is
 a rigid acceleration field over the whole body (no sag), with gravity fed forward and an implicit critically damped PD
@@ -14,8 +14,9 @@ import warp as wp
 
 from piavatar_envs.avatar.controller import critical_pull
 from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log
-from piavatar_envs.avatar.tracking import spin_of
+from piavatar_envs.avatar.tracking import kabsch_rotation, spin_of
 from piavatar_envs.avatar.types import (
+    Anchor,
     Body,
     Carry,
     Command,
@@ -28,7 +29,7 @@ from piavatar_envs.avatar.types import (
     Wrench,
 )
 from piavatar_envs.core.arrays import vec12, vec16
-from piavatar_envs.core.cuda_intrinsics import sum_threads16
+from piavatar_envs.core.cuda_intrinsics import sum_threads12, sum_threads16
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -100,6 +101,53 @@ def hold_root(
     share = 1.0 / float(control.num_substeps)
     root.wrench_force[e] = root.wrench_force[e] + share * mass * a
     root.wrench_torque[e] = root.wrench_torque[e] + share * torque
+
+
+@wp.func
+def bone_place(body: Body, pose: Pose, e: int, b: int):
+    """Return the centre of mass of a bone in a pose [m]."""
+    arm = body.rest_center[row(e, body.bone_mass.shape[0]), b] - body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    return pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm)
+
+
+@wp.func
+def lay_command(
+    body: Body,
+    command: Pose,
+    pose: Pose,
+    e: int,
+    thread: int,
+    threads: int,
+    # out
+    anchor: Anchor,
+):
+    """Fit the rigid motion from the commanded to the tracked pose: Kabsch over the bones' centres of mass."""
+    r = row(e, body.bone_mass.shape[0])
+    m = float(0.0)
+    x = wp.vec3()
+    y = wp.vec3()
+    for b in range(thread, body.parent.shape[0], threads):
+        w = body.bone_mass[r, b]
+        m += w
+        x += w * bone_place(body, pose, e, b)
+        y += w * bone_place(body, command, e, b)
+    s = sum_threads12(vec12(m, x[0], x[1], x[2], y[0], y[1], y[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
+    mean = wp.vec3(s[1], s[2], s[3]) / s[0]
+    mean_command = wp.vec3(s[4], s[5], s[6]) / s[0]
+    H = wp.mat33()
+    for b in range(thread, body.parent.shape[0], threads):
+        at = bone_place(body, pose, e, b) - mean
+        H += body.bone_mass[r, b] * wp.outer(at, bone_place(body, command, e, b) - mean_command)
+    # fmt: off
+    t = sum_threads12(
+        vec12(H[0, 0], H[0, 1], H[0, 2], H[1, 0], H[1, 1], H[1, 2], H[2, 0], H[2, 1], H[2, 2], 0.0, 0.0, 0.0), threads
+    )
+    # fmt: on
+    if thread == 0:
+        H = wp.mat33(t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8])
+        q = wp.normalize(wp.quat_from_matrix(kabsch_rotation(H)))
+        anchor.rotation[e] = q
+        anchor.translation[e] = mean - wp.quat_rotate(q, mean_command)
 
 
 @wp.func

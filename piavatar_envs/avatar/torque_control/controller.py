@@ -16,11 +16,12 @@ from piavatar_envs.avatar.body.device import BodyPoints
 from piavatar_envs.avatar.body.muscles import (
     FASTEST,
     LOCKED_JOINTS,
+    REFERENCE_HEIGHT,
+    REFERENCE_MASS,
     Muscles,
     spring_rows,
 )
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.avatar.controller import body_size
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple
@@ -40,6 +41,7 @@ LONGEST_SUBSTEP = 0.004
 ASSIST_TORQUE = 1500.0
 _FASTEST = wp.constant(FASTEST)
 _ASSIST_TORQUE, _ASSIST_RATE = wp.constant(ASSIST_TORQUE), wp.constant(ROOT_RATE)
+_HEAD, _FOOT = wp.constant(joint_index("head")), wp.constant(joint_index("left_foot"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,7 @@ def set_springs(
     body: Body,
     gains: Springs,
     body_mass: wp.array(dtype=float),
+    per_size: float,
     assist: wp.array(dtype=float),
     released: wp.array(dtype=int),
     torque: wp.array2d(dtype=wp.vec3),
@@ -82,7 +85,8 @@ def set_springs(
     """
     e, n = wp.tid()
     m = body_mass[row(e, body_mass.shape[0])]
-    size = body_size(body, m, e)
+    r = row(e, body.rest_joint.shape[0])
+    size = per_size * m * (body.rest_joint[r, _HEAD][2] - body.rest_joint[r, _FOOT][2])
     K = size * gains.stiffness[0, n]
     D = size * gains.damping[0, n]
     if n == 0:
@@ -202,6 +206,10 @@ class TorqueController:
         stiffness, damping = (wp.array(values, dtype=float, device=model.device) for values in gains)
         self.gains = make_struct(Springs, stiffness=stiffness, damping=damping)
         self.assist = wp.full(n, parameters.root_assist, dtype=float, device=model.device)
+        # height over the span from foot to head joint, in the first body
+        joints, rest = points.joints[0], points.rest[0]
+        span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
+        self._per_size = float(np.ptp(rest[:, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
         self.first: tuple[wp.array, wp.array] | None = None
         self._first_pose = allocate(Pose, n, model.device)
 
@@ -237,7 +245,7 @@ class TorqueController:
         """Append the start of a control step: strength and springs for the current bodies."""
         avatar, joints = self.avatar, self.joints
         avatar.record_clear_support(graph)
-        inputs = [avatar.body, self.gains, avatar.body_mass, self.assist, avatar.state.released]
+        inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, self.assist, avatar.state.released]
         graph.launch(
             set_springs,
             (avatar.model.num_envs, 1 + NUM_JOINTS),

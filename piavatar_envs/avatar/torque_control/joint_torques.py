@@ -21,7 +21,6 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.controller import implicit_inertia, spring_error
 from piavatar_envs.avatar.rotation import quat_log, short_of_pi, torque_of_vector
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple, triple_of
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
@@ -112,6 +111,12 @@ def make_tissue(
     for name, bound in (("lower", lower), ("upper", upper)):
         arrays[name] = wp.array(bound.astype(np.float32), dtype=wp.vec3, device=device)
     return make_struct(Tissue, **arrays)
+
+
+@wp.func
+def implicit_inertia(dt: float, stiffness: float, damping: float):
+    """Return ``A = dt D + dt^2 K``: the inertia of a spring and a damper, implicit in time."""
+    return dt * damping + dt * dt * stiffness
 
 
 @wp.func
@@ -208,7 +213,7 @@ def joint_impulse(
         b = n - 1
         frame = above(body, pose.rotation, e, b)
         local = wp.quat_inverse(frame) * pose.rotation[e, b]
-        push = K * spring_error(target.rotation[e, b], local)
+        push = K * quat_log(target.rotation[e, b] * wp.quat_inverse(local))
         if b > 0:
             push += target.factor[row(e, target.factor.shape[0])] * target.torque[e, b]
             stiff = stop[e, b]
