@@ -97,4 +97,4 @@ def check_refusals(block: str, space: dict) -> None:
     for typed, said in zip(lines[::2], lines[1::2], strict=True):
         with pytest.raises(ConfigError) as refused:
             exec(typed.removeprefix(">>> "), space)
-        assert said == f"ConfigError: {refused.value}"
+        assert said == f"{type(refused.value).__name__}: {refused.value}"

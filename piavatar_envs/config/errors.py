@@ -37,6 +37,10 @@ class ConfigError(ValueError):
 class UnexpectedKeyword(ConfigError, TypeError):
     """A keyword of a call that is no setting; libraries that try their own keywords look for Python's TypeError."""
 
+    def __init__(self, *errors: object) -> None:
+        # gym.make appends all arguments of the call to the message of a TypeError
+        super().__init__(*(str(error).partition(" was raised from the environment creator")[0] for error in errors))
+
 
 def setting_keys(cls: type[BaseModel]) -> tuple[str, ...]:
     """Return the dotted names of all settings of ``cls``, in order, e.g. ``("physics.fidelity", ..., "obs_mode")``."""

@@ -1,7 +1,7 @@
 """Strain measured against the rest shape: what the grid does not see of deformation fades.
 
 The substep integrates the deformation gradient ``F`` from velocity gradients, and errors add up: in limbs that swing
-for minutes, or a prop that spins, ``F`` would come to differ from the deformation that the particles have. Han et al.
+for minutes ``F`` would come to differ from the deformation that the particles have. Han et al.
 (arXiv 2606.21162) define it without history, ``F = F_total (F^k)^-1``. Both gradients can be measured at any time,
 fitted to the neighbours that a particle has at rest by moving least squares (Lancaster and Salkauskas 1981). With
 differences between neighbour and particle, of positions ``x``, unstrained places ``L`` and rest positions ``X``, they
@@ -10,7 +10,7 @@ are
     F_total = (sum dx dX^T) (sum dX dX^T)^-1,   F^k = (sum dL dX^T) (sum dX dX^T)^-1,
 
 so that ``F = (sum dx dX^T) (sum dL dX^T)^-1``. The unstrained places of flesh are its skinned ones, at which ``F = I``
-exactly in any pose; those of a prop are its rest shape. After every control step ``F`` approaches this value at
+exactly in any pose. After every control step ``F`` approaches this value at
 :data:`RATE`; contact and waves are much faster, and stay as the solver integrates them.
 
 Displacements that alternate from particle to particle have no gradient, so that no stress opposes them: hourglass
@@ -66,7 +66,7 @@ def make_neighbours(links: np.ndarray, count: int, device: str) -> Neighbours:
 
 
 class MeasuredStrain:
-    """Strain of one subject, a body or a prop, against its rest shape.
+    """Strain of one subject against its rest shape.
 
     Attributes:
         neighbours: of its particles.

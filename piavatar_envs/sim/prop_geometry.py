@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.body.sampling import LINK_LENGTH, ClosedSurface
+from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.reading import reading
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS, solid_distance
@@ -44,14 +44,12 @@ class PropPoints:
         volume: their volumes [m^3], which add up to the solid's, shape ``(P,)`` float64.
         vertices: surface for pictures [m], shape ``(V, 3)`` float32.
         faces: its triangles, outward, shape ``(T, 3)`` int32.
-        links: pairs of neighbouring particles, not across a gap, shape ``(L, 2)`` int32.
     """
 
     rest: np.ndarray
     volume: np.ndarray
     vertices: np.ndarray
     faces: np.ndarray
-    links: np.ndarray
 
     def __post_init__(self):
         for array in vars(self).values():
@@ -244,16 +242,7 @@ def _particles(solid: _Solid, spacing: float) -> PropPoints:
     # differs a little from the centre of a coarsely sampled mesh; the surface moves with the particles
     centre = share @ rest
     surface = (solid.vertices - centre).astype(np.float32)
-    links = _links(rest, solid)
-    return PropPoints((rest - centre).astype(np.float32), share * solid.volume, surface, solid.faces, links)
-
-
-def _links(places: np.ndarray, solid: _Solid) -> np.ndarray:
-    """Return neighbouring particles ``(L, 2)`` int32; the middle of a link lies inside the solid."""
-    reach = LINK_LENGTH * (solid.volume / len(places)) ** (1.0 / 3.0)
-    links = cKDTree(places).query_pairs(reach, output_type="ndarray")
-    links = links[np.lexsort((links[:, 1], links[:, 0]))]
-    return links[solid.distance(places[links].mean(axis=1)) < 0.0].astype(np.int32)
+    return PropPoints((rest - centre).astype(np.float32), share * solid.volume, surface, solid.faces)
 
 
 def _lattice(solid: _Solid, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:

@@ -15,7 +15,6 @@ from piavatar_envs.config.schema import LEAST_DENSITY, MOST_DENSITY
 from piavatar_envs.core.arrays import store_matrix
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.materials import lame_parameters, retardation_time
-from piavatar_envs.mpm.measured_strain import MeasuredStrain
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Kinematic, Model, Particles, State, row
 from piavatar_envs.sim import prop_geometry as geometry
@@ -89,7 +88,7 @@ class Prop:
 
     first: int
     count: int
-    rest: wp.array2d(dtype=wp.vec3)  # (1, count) about the centre of mass [m]
+    rest: wp.array(dtype=wp.vec3)  # (count,) about the centre of mass [m]
 
 
 @wp.struct
@@ -105,7 +104,7 @@ def upload_prop(points: PropPoints, first: int, device: str) -> Prop:
     """Upload the constants of a prop whose particles begin at index ``first``."""
     prop = Prop()
     prop.first, prop.count = int(first), len(points.rest)
-    prop.rest = wp.array(points.rest[None], dtype=wp.vec3, device=device)
+    prop.rest = wp.array(points.rest, dtype=wp.vec3, device=device)
     return prop
 
 
@@ -193,9 +192,6 @@ class PropSet:
         self.points, self.model, self.fields_of = tuple(points), model, tuple(fields_of)
         n, device = model.num_envs, model.device
         self.props = [upload_prop(own, begin, device) for own, begin in zip(points, first, strict=True)]
-        self.strain = [
-            MeasuredStrain(model, own.links, begin, len(own)) for own, begin in zip(points, first, strict=True)
-        ]
         self.matter = [nominal_matter(own) for own in matter]
         self.volume = np.array([float(own.volume.sum()) for own in points])
         self.mass = np.array([m.density * own.volume.sum() for m, own in zip(self.matter, points, strict=True)])
@@ -245,11 +241,6 @@ class PropSet:
             [state.x, state.u, state.C, state.F, state.kinematic],
         )
 
-    def record_strain(self, graph: LaunchGraph, state: State) -> None:
-        """Record the launches that end a control step: correct the strain of each prop against its rest shape."""
-        for prop, strain in zip(self.props, self.strain, strict=True):
-            strain.record(graph, state, prop.rest, prop.rest)
-
     def record_tracking(self, graph: LaunchGraph, state: State) -> None:
         """Record the launches that fit a rigid motion to the particles of each prop."""
         s = self.state
@@ -294,7 +285,7 @@ def place_prop(
     e, p = wp.tid()
     if not mask[e]:
         return
-    arm = wp.quat_rotate(rotation[e, index], prop.rest[0, p])
+    arm = wp.quat_rotate(rotation[e, index], prop.rest[p])
     q = prop.first + p
     x[e, q] = position[e, index] + arm
     u[e, q] = velocity[e, index] + wp.cross(spin[e, index], arm)
@@ -347,14 +338,14 @@ def track_prop(
         q = prop.first + p
         m = particles.mass[r, q]
         d = x[e, q] - c
-        H += m * wp.outer(d, prop.rest[0, p])
+        H += m * wp.outer(d, prop.rest[p])
         I += point_inertia(m, d)
         L += m * wp.cross(d, u[e, q] + vk[e, q] - V)
     R = kabsch_rotation(H)
     square = float(0.0)
     for p in range(prop.count):
         q = prop.first + p
-        square += particles.mass[r, q] * wp.length_sq(x[e, q] - c - R * prop.rest[0, p])
+        square += particles.mass[r, q] * wp.length_sq(x[e, q] - c - R * prop.rest[p])
     position[e, index] = c
     rotation[e, index] = wp.normalize(wp.quat_from_matrix(R))
     velocity[e, index] = V

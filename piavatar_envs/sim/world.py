@@ -296,7 +296,6 @@ def record_control_step(
     if sensors_first:
         graph.parallel(*ends)
     if props:
-        props.record_strain(graph, state)
         props.record_tracking(graph, state)
     if forces:
         forces.record_end(graph, state)

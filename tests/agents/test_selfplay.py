@@ -197,7 +197,7 @@ def test_cooperation_learns_to_meet(games, tmp_path):
 
 
 def game(totals, success, steps=3):
-    return Episode(5, steps=steps, agent_totals=np.array(totals, float), agent_success=np.array(success), failure=None)
+    return Episode(5, steps=steps, agent_totals=np.array(totals, float), agent_success=np.array(success))
 
 
 def test_a_match_counts_from_the_players_seat():

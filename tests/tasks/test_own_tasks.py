@@ -158,7 +158,7 @@ def test_a_registered_task_is_an_environment_like_all_others(elsewhere, device):
     *_, info = env.step(np.zeros(env.action_space.shape))
     assert info["reward_height"] == pytest.approx(info["best"], abs=0.05) and info["best"] > 0.7
     spec = env.spec
-    assert spec.max_episode_steps is None
+    assert spec.max_episode_steps == 150
     for name in ("Elsewhere/Balance-v0", "other_tasks:BalanceTask", found):
         made = gym.make(spec, task=name, fidelity="tiny", device=device)
         assert type(made.unwrapped.batch.task) is found
