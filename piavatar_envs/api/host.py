@@ -425,7 +425,7 @@ class EpisodeHost:
         if not self.groups[0].simulation.forces:
             for group in self.groups:
                 group.enable_forces()
-            self._captured.discard(BatchEnv.step)
+            self._captured.clear()  # their steps and resets have new graphs
 
     def with_forces(self, state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return ``state`` with arrays of external forces if the environments have some, and give them some if it has.

@@ -49,7 +49,7 @@ def symmetric(diag: wp.vec3, off: wp.vec3):
 
 @wp.func
 def summed_second_moment(s: vec16):
-    """Return the second moment [kg m^2] of a bone's sums, which have it from component 7 on."""
+    """Return the second moment [kg m^2] of the sums over a bone or a prop, which have it from component 7 on."""
     return symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
 
 

@@ -37,7 +37,7 @@ from piavatar_envs.avatar.skinning import unpack
 from piavatar_envs.avatar.torque_control.bone_contact import moves_bone
 from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple
-from piavatar_envs.avatar.tracking import spin_of, symmetric
+from piavatar_envs.avatar.tracking import spin_of, summed_second_moment
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.core.arrays import vec16
 from piavatar_envs.core.cuda_intrinsics import (
@@ -319,12 +319,6 @@ def _columns(declared: Mapping[str, Any], num_envs: int, columns: int, device: s
     }
 
 
-@wp.func
-def is_finite(v: wp.vec3):
-    """Return whether all components are finite."""
-    return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
-
-
 @wp.kernel
 def add_force(
     call: Call,
@@ -354,7 +348,7 @@ def add_force(
         s = _SLOTS - 1 - back
         if slots.remaining[e, s] <= 0:
             free = s
-    if free == _SLOTS or not (is_finite(call.force[e]) and is_finite(local)):
+    if free == _SLOTS or not (wp.isfinite(call.force[e]) and wp.isfinite(local)):
         failure[e] = failure[e] | _FORCE
         return
     slots.remaining[e, free] = steps
@@ -493,7 +487,7 @@ def solve_fields(
     for c in range(targets.start[target], targets.start[target + 1]):
         s += fields.moments[e, c]
     d = wp.vec3(s[1], s[2], s[3]) / s[0]
-    second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12])) - s[0] * wp.outer(d, d)
+    second = summed_second_moment(s) - s[0] * wp.outer(d, d)
     inertia = wp.diag(wp.vec3(wp.trace(second))) - second
     center = origin_of(targets, x, e, target) + d
     arm = fields.arm[e, i]
