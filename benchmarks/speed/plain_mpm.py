@@ -140,7 +140,7 @@ class WarpMPM:
 
     def positions(self) -> np.ndarray:
         """Return the particles' positions [m], shape ``(count, 3)``."""
-        return self.x.numpy()
+        return self.x.numpy().copy()
 
     def _substeps(self) -> None:
         grid = [self.momentum, self.mass]

@@ -17,6 +17,7 @@ from gymnasium.utils import seeding
 
 from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.pictures import Live, Pictures
+from piavatar_envs.api.readings import find_reading
 from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.config import replace as replace_settings
@@ -301,6 +302,18 @@ class EpisodeHost:
     def alive(self) -> Array:
         """Return which agents act in the next step if the clock has not run out, ``(num_envs, num_agents)`` bool."""
         return self.read(lambda group: group.alive)
+
+    def reading(self, name: str, agent: str | None = None) -> Array:
+        """Copy a quantity of the world; see :meth:`HostView.read`."""
+        self.check_ready("read")
+        reading, names = find_reading(name), self.task.agent_names
+        if agent is not None and not reading.of_bones:
+            raise ValueError(f"{name} is of the world, not of an agent; leave out agent={agent!r}")
+        if reading.of_bones and agent not in names and (agent is not None or len(names) > 1):
+            raise ValueError(f"agent={agent!r} is not one of {', '.join(names)}")
+        index = 0 if agent is None else names.index(agent)
+        values = self.read(lambda group: reading.array_of(group.simulation, index))
+        return reading.converted(values, len(self.groups[0].simulation.props))
 
     # infos
 
@@ -608,6 +621,21 @@ class HostView:
         """
         self.host.apply_force(target, force, point, steps, agent, envs)
 
+    def read(self, name: str, agent: str | None = None) -> Array:
+        """Return a copy of a quantity of the world by name, a row an environment; docs/scenes.md lists them.
+
+        Quaternions are ``wxyz``. The names are those of :data:`piavatar_envs.api.readings.READINGS`.
+
+        Args:
+            name: of the quantity: ``"bone_position"``, ``"particle_position"``, ``"prop_velocity"``, ...
+            agent: whose bones, by name, where there are several agents.
+
+        Raises:
+            ValueError: an unknown name or agent.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        return self.host.reading(name, agent)
+
     def get_state(self) -> dict[str, np.ndarray]:
         """Return everything that the future depends on; ``set_state()`` restores it, bit for bit.
 
@@ -623,6 +651,21 @@ class SingleView(HostView):
     def batch(self) -> BatchEnv:
         """The environment on the device, a batch of one."""
         return self.host.groups[0]
+
+    def read(self, name: str, agent: str | None = None) -> np.ndarray:
+        """Return a NumPy copy of a quantity of the world by name; docs/scenes.md lists them.
+
+        Quaternions are ``wxyz``. The names are those of :data:`piavatar_envs.api.readings.READINGS`.
+
+        Args:
+            name: of the quantity: ``"bone_position"``, ``"particle_position"``, ``"prop_velocity"``, ...
+            agent: whose bones, by name, where there are several agents.
+
+        Raises:
+            ValueError: an unknown name or agent.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        return self.host.reading(name, agent)[0]
 
     def _observation(self, agent: int) -> Any:
         """Copy the observation of an agent: a flat vector, or a dictionary with ``obs_mode="dict"``."""

@@ -132,6 +132,10 @@ class SB3VecEnv(VecEnv):
         """Let a force act on a bone or a prop; see :meth:`piavatar_envs.api.host.HostView.apply_force`."""
         self.vector.apply_force(*args, **kwargs)
 
+    def read(self, name: str, agent: str | None = None) -> np.ndarray:
+        """Return a copy of a quantity of the world; see :meth:`piavatar_envs.api.host.HostView.read`."""
+        return self.vector.read(name, agent)
+
     def close(self) -> None:
         """Free the renderers and end the threads."""
         self.vector.close()

@@ -48,7 +48,7 @@ class VectorCalls:
     _own: frozenset[str]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call ``reset``, ``render``, ``get_state``, ``set_state``, ``assist_root`` or ``apply_force`` of each.
+        """Call a method of each: reset, render, read, get_state, set_state, assist_root or apply_force.
 
         Args:
             name: of the method; other attributes are read as by :meth:`get_attr`.
@@ -115,6 +115,7 @@ class VectorCalls:
         """Call a method as :meth:`call` does, for each of ``envs``; the others go on."""
         own = {"reset": self._reset_some, "get_state": self._states, "set_state": self._set_states}
         own |= {"render": self._frames, "assist_root": self._assist_some, "apply_force": self._push_some}
+        own |= {"read": self._read_some}
         if name in own:
             return own[name](list(envs), *args, **kwargs)
         if not callable(getattr(type(self), name, None)):
@@ -169,6 +170,10 @@ class VectorCalls:
     def _push_some(self, envs: Sequence[int], *args: Any, **kwargs: Any) -> list[None]:
         self.host.apply_force(*args, **kwargs, envs=self._mask(envs))
         return [None for _ in envs]
+
+    def _read_some(self, envs: Sequence[int], name: str, agent: str | None = None) -> list[Array]:
+        values = self.host.reading(name, agent)
+        return [values[env] for env in envs]
 
     def _mask(self, envs: Sequence[int]) -> np.ndarray:
         mask = np.zeros(self.num_envs, bool)

@@ -215,7 +215,10 @@ class AvatarState:
 
 @dataclass
 class Tracked:
-    """Bones tracked from the particles, recomputed whenever these have moved."""
+    """Bones tracked from the particles: live arrays, recomputed whenever these have moved.
+
+    Quaternions are Warp's ``xyzw``; :meth:`piavatar_envs.api.host.HostView.read` returns copies with ``wxyz``.
+    """
 
     rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) world rotation
     position: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint position [m]

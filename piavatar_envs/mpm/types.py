@@ -113,7 +113,7 @@ class Contact:
 
 @wp.struct
 class Sensors:
-    """Contact over the control step, and at the nodes in this substep."""
+    """Contact over the control step, and at the nodes in this substep; live arrays."""
 
     accumulators: wp.array2d(dtype=wp.int64)  # (num_envs, 3 * entries) see :mod:`piavatar_envs.mpm.contact_sensors`
     boundary_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S) impulse of the colliders on a subject [N s]
@@ -279,9 +279,10 @@ class Model:
 
 @dataclass
 class State:
-    """Evolving state: a checkpoint holds exactly this. Shapes ``(num_envs, num_particles)`` and ``(num_envs,)``.
+    """Evolving state, in live arrays: a checkpoint holds exactly this.
 
-    Matrices are stored by component, ``(num_envs, 9, num_particles)``; see :mod:`piavatar_envs.core.arrays`.
+    Shapes are ``(num_envs, num_particles)`` and ``(num_envs,)``. Matrices are stored by component,
+    ``(num_envs, 9, num_particles)``; see :mod:`piavatar_envs.core.arrays`.
     """
 
     x: wp.array  # position [m]

@@ -119,7 +119,7 @@ def nominal_matter(matter: MaterialPoints) -> PropMatter:
 
 @dataclass
 class PropState:
-    """Tracked props, each of shape ``(num_envs, num_props)``; quaternions are Warp's ``xyzw``."""
+    """Tracked props: live arrays, each of shape ``(num_envs, num_props)``; quaternions are Warp's ``xyzw``."""
 
     position: wp.array  # centre of mass [m]
     rotation: wp.array  # rest frame to world

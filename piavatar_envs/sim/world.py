@@ -47,6 +47,9 @@ GRID_PER_HEIGHT: dict[str, float] = {
 class Simulation:
     """Avatars and props in each of ``num_envs`` worlds.
 
+    Its arrays are live: every step overwrites them, and on a CPU their ``numpy()`` is a view of them.
+    :meth:`piavatar_envs.api.host.HostView.read` returns copies.
+
     Attributes:
         config, scene: settings, and what is in the world.
         asset: the body of the first avatar.
