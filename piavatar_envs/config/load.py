@@ -23,6 +23,7 @@ from piavatar_envs.config.errors import (
     entry_of,
     error_line,
     models_of,
+    section_of,
     setting_keys,
     shown,
     variants_of,
@@ -74,6 +75,8 @@ def load_config(
     path = source if isinstance(source, (str, Path)) else None
     base = _expand(cls, _read_settings(cls, Path(path)) if path is not None else _settings("config", source))
     above = _expand(cls, _settings("overrides", overrides))
+    chosen = _merge(base, above)
+    base, above = _with_preset(cls, base, chosen), _with_preset(cls, above, chosen)
     merged = _merge(_without_replaced_variants(cls, base, above), above)
     merged = _merge(_own_defaults(cls, merged), merged)
     try:
@@ -301,6 +304,26 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
         merged[key] = _merge(merged[key], value) if both else value
     return merged
+
+
+def _with_preset(cls: type[BaseModel], layer: dict[str, Any], chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """Add the settings of the preset that a layer names, if it does; the layer's other settings win over them.
+
+    Args:
+        cls: the model, which may have ``presets``.
+        layer: expanded settings.
+        chosen: all expanded settings, which say what variant of a union it is.
+    """
+    name = layer.get("preset")
+    preset = getattr(cls, "presets", {}).get(name) if isinstance(name, str) else None
+    if preset is None:
+        return layer
+    known: dict[str, Any] = {}
+    for section, settings in preset.items():
+        field, given = cls.model_fields[section], chosen.get(section) or {}
+        model = _variant(field, given) if variants_of(field) else section_of(field.annotation)
+        known[section] = {key: value for key, value in settings.items() if model and key in model.model_fields}
+    return _merge(known, layer)
 
 
 def _without_replaced_variants(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -581,11 +581,25 @@ class RenderConfig(BaseModel):
     )
 
 
+#: Settings of each preset; those that the mode of control does not have are left out.
+PRESETS: dict[str, dict[str, dict[str, float]]] = {
+    "firm": {"physics": {"young_modulus": 1.0e5}, "control": {"tone": 1.0, "joint_stiffness": 1.0}},
+    "soft": {"physics": {"young_modulus": 2.0e4}, "control": {"tone": 0.1, "joint_stiffness": 0.3}},
+    "limp": {"physics": {"young_modulus": 2.0e4}, "control": {"tone": 0.0, "joint_stiffness": 0.0}},
+}
+
+
 class EnvConfig(BaseModel):
     """Settings of every environment; a task adds its own in a subclass."""
 
     model_config = FROZEN
+    presets: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = PRESETS
 
+    preset: Literal["firm", "soft", "limp"] | None = Field(
+        None,
+        description="settings of body and joints in one word, over which given settings win: firm (young_modulus 1e5, "
+        "tone or joint_stiffness 1), soft (2e4, tone 0.1 or joint_stiffness 0.3), limp (2e4 and 0); null sets nothing",
+    )
     physics: PhysicsConfig = Field(default_factory=PhysicsConfig, description="the continuum")
     control: ControlConfig = Field(default_factory=PoseControlConfig, description="how actions move the body")
     avatar: AvatarSourceConfig = Field(default_factory=AvatarSourceConfig, description="the source of the body")

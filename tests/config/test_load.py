@@ -167,3 +167,25 @@ def test_another_mode_begins_with_its_defaults():
     assert replace(under_torques, control="torque").control == TorqueControlConfig(mode="torque", strength=2.0)
     assert replace(under_torques, control="pose").control == PoseControlConfig(joint_speed_limit=7.0)
     assert load_config(Held, None, {"control": "pose"}).control == PoseControlConfig()
+
+
+@pytest.mark.parametrize(
+    ("mode", "joints"),
+    [("pose", {"tone": 0.1}), ("pd", {"joint_stiffness": 0.3}), ("torque", {"joint_stiffness": 0.3})],
+)
+def test_a_preset_softens_body_and_joints_in_any_mode(mode, joints):
+    """Set what the mode of control has, whichever of preset and mode comes from a file and which from a keyword."""
+    for source, overrides in (({"preset": "soft"}, {"control": mode}), ({"control": mode}, {"preset": "soft"})):
+        config = load_config(Task, source, overrides)
+        assert config.physics.young_modulus == 2.0e4
+        assert joints.items() <= config.control.model_dump().items()
+
+
+def test_settings_win_over_a_preset_and_a_later_preset_over_settings():
+    soft = load_config(Task, {"preset": "soft", "tone": 0.5})
+    assert (soft.physics.young_modulus, soft.control.tone) == (2.0e4, 0.5)
+    assert load_config(Task, yaml.safe_load(dump_yaml(soft))) == soft
+    stiffer = replace(soft, young_modulus=5.0e4)
+    assert (stiffer.physics.young_modulus, stiffer.control.tone) == (5.0e4, 0.5)
+    firm = replace(stiffer, preset="firm")
+    assert (firm.physics, firm.control) == (Task().physics, Task().control)
