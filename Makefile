@@ -8,13 +8,14 @@ EXTRAS := render,live,train,motions,multi,props,skrl,rsl,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test test-lowest lint format docs clean
+.PHONY: help install demo test test-lowest clients-light lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
 	@echo "make demo      train PPO on PIAvatar/Reach-v0 on the CPU (ten minutes at most), leaves runs/demo/"
 	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
 	@echo "make test-lowest   test the views under the oldest supported Gymnasium and PettingZoo"
+	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too; CHECK=1 compares only)"
 	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
@@ -55,6 +56,17 @@ test-lowest: install
 	test -d $(LOWEST) || $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(LOWEST) gymnasium==1.1.1 pettingzoo==1.24.3
 	PYTHONPATH=$(LOWEST) $(PYTEST) tests/api/test_gymnasium.py tests/api/test_vector.py tests/multi/test_api.py \
 	  -k "not picture and not camera and (test_gymnasium or Kick or pettingzoo or wrappers or first_reset)"
+
+# Clients of other projects in a folder of their own, installed anew after their pins change. One process, whose
+# imports take longer than its tests.
+CLIENTS := $(VENV)/clients
+$(CLIENTS)/.installed: $(STAMP) tests/clients/requirements.txt
+	rm -rf $(CLIENTS)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(CLIENTS) --requirement tests/clients/requirements.txt
+	@touch $@
+
+clients-light: $(CLIENTS)/.installed
+	PYTHONPATH=$(CLIENTS) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/clients
 
 lint: install
 	$(BIN)/ruff check .

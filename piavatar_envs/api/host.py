@@ -672,12 +672,15 @@ class SingleView(HostView):
         return self.host.named(self.host.observation()[0, agent])
 
     def _info(self, agent: int, stepped: bool = False) -> dict[str, Any]:
-        """Return the info of an agent as Python's numbers and vectors; the outcome of a step is zero at a reset."""
+        """Return the info of an agent as numbers and vectors; the outcome of a step is zero at a reset.
+
+        A real number is a NumPy float64, which is a Python float and has the ``dtype`` that TorchRL's reader needs.
+        """
         outcome = self.host.outcome(agent)
         if not stepped:
             outcome = {name: np.zeros_like(value) for name, value in outcome.items()}
         values = self.host.status(agent) | outcome
-        return {name: value[0] if value.ndim > 1 else value[0].item() for name, value in values.items()}
+        return {name: _single(value[0]) for name, value in values.items()}
 
     def render(self) -> np.ndarray | None:
         """Draw the scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``; else return None.
@@ -743,3 +746,10 @@ def checked_seed(seed: Any) -> int:
 def _unbounded(size: int) -> gym.spaces.Box:
     """Return the space of all vectors of ``size`` float32."""
     return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+
+def _single(value: np.ndarray | np.generic) -> Any:
+    """Return a vector as it is, a real number as NumPy's float64, an integer or a truth value as Python's."""
+    if np.ndim(value):
+        return value
+    return np.float64(value) if np.issubdtype(value.dtype, np.floating) else value.item()
