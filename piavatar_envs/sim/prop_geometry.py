@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from piavatar_envs.avatar.body.asset import mesh_volume
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.reading import reading
@@ -28,6 +29,7 @@ MIN_PARTICLES = 8
 MAX_CELLS = 200_000  # of the lattice around a solid
 MIN_CELLS = 2  # along each axis, because one layer has no orientation
 SUBDIVISIONS = 3  # points per axis and cell that measure the part of it inside
+OVERLAP_SAMPLES = 20_000  # of the box in which parts of a mesh may overlap
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
 MAX_MISSED = 0.25  # share of a mesh's volume that the lattice may miss or count twice
 SEGMENTS = 32  # around a round surface
@@ -148,16 +150,89 @@ def mesh(path: str | Path, spacing: float, scale: float = 1.0) -> PropPoints:
     _check_lengths(path.name, spacing=spacing, scale=scale)
     shape = _load(path)
     shape.apply_scale(scale)
-    shape.apply_translation(-shape.center_mass)
+    parts = _orient_parts(shape)
+    if not shape.volume > 0.0:
+        raise ValueError(f"{path.name} encloses no volume; export a solid, not a sheet")
+    volume, centre, spread = shape.volume, shape.center_mass, _spread(shape.moment_inertia, shape.volume)
+    excess = _excess(shape.vertices, parts)
+    if len(excess):
+        volume, centre, spread = _without(volume, centre, spread, excess)
+    shape.apply_translation(-centre)
     vertices, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.int32)
-    inertia = shape.moment_inertia  # of density one
-    spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / shape.volume
     surface = ClosedSurface(vertices, faces)
-    return _particles(_Solid(path.name, surface.distance, float(shape.volume), spread, vertices, faces), spacing)
+    return _particles(_Solid(path.name, surface.distance, float(volume), spread, vertices, faces), spacing)
+
+
+def _spread(inertia: np.ndarray, volume: float) -> np.ndarray:
+    """Return the mean of ``x x^T`` about the centre of mass [m^2], of a moment of inertia of density one."""
+    return (0.5 * np.trace(inertia) * np.eye(3) - inertia) / volume
+
+
+def _orient_parts(shape) -> list[np.ndarray]:
+    """Turn the closed parts of a ``trimesh.Trimesh`` outward, but for cavities, and return the faces of each.
+
+    A part that faces inward is a cavity if it lies in a solid part; elsewhere it is a part that was left inside out.
+    """
+    import trimesh
+
+    labels = trimesh.graph.connected_component_labels(shape.face_adjacency, node_count=len(shape.faces))
+    if shape.volume < 0.0:
+        shape.invert()
+    faces = np.array(shape.faces)
+    belongs = [labels == label for label in range(labels.max() + 1)]
+    inward = [mesh_volume(shape.vertices, faces[mine]) < 0.0 for mine in belongs]
+    if any(inward):
+        solid = np.any([mine for mine, hole in zip(belongs, inward, strict=True) if not hole], axis=0)
+        outward = ClosedSurface(shape.vertices, faces[solid])
+        for mine in (mine for mine, hole in zip(belongs, inward, strict=True) if hole):
+            corners = shape.vertices[np.unique(faces[mine])]
+            if (outward.distance(corners) > 0.0).any():
+                faces[mine] = faces[mine][:, ::-1]
+        shape.faces = faces
+    return [faces[mine] for mine in belongs]
+
+
+def _excess(vertices: np.ndarray, parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return where closed parts overlap: samples ``(S, 4)`` of position [m] and of volume counted too often [m^3].
+
+    The sum of signed volumes counts a point once for every solid part around it, less once for every cavity.
+    """
+    boxes = [(vertices[np.unique(part)].min(axis=0), vertices[np.unique(part)].max(axis=0)) for part in parts]
+    shared = [
+        (np.maximum(a[0], b[0]), np.minimum(a[1], b[1]))
+        for index, a in enumerate(boxes)
+        for b in boxes[:index]
+        if (np.maximum(a[0], b[0]) < np.minimum(a[1], b[1])).all()
+    ]
+    if not shared:
+        return np.empty((0, 4))
+    low, high = np.min([box[0] for box in shared], axis=0), np.max([box[1] for box in shared], axis=0)
+    # additive recurrence of the root of x^4 = x + 1, which fills a box evenly and is aligned with no face
+    steps = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+    points = low + (high - low) * ((0.5 + np.arange(OVERLAP_SAMPLES)[:, None] * steps) % 1.0)
+    around = np.zeros(len(points))
+    for part, (least, most) in zip(parts, boxes, strict=True):
+        near = np.flatnonzero(((points > least) & (points < most)).all(axis=1))
+        if len(near):
+            sign = np.sign(mesh_volume(vertices, part))
+            around[near] += sign * (ClosedSurface(vertices, part[:, :: int(sign)]).distance(points[near]) < 0.0)
+    extra = around - (around > 0.0)
+    found = extra != 0.0
+    weight = (high - low).prod() / OVERLAP_SAMPLES * extra[found, None]
+    return np.concatenate([points[found], weight], axis=1)
+
+
+def _without(volume: float, centre: np.ndarray, spread: np.ndarray, excess: np.ndarray) -> tuple:
+    """Return the volume [m^3], centre of mass [m] and spread [m^2] of a solid without what was counted too often."""
+    points, share = excess[:, :3], excess[:, 3]
+    total = volume - share.sum()
+    middle = (volume * centre - share @ points) / total
+    second = volume * (spread + np.outer(centre, centre)) - np.einsum("s,si,sj->ij", share, points, points)
+    return total, middle, second / total - np.outer(middle, middle)
 
 
 def _load(path: Path):
-    """Load a file as a ``trimesh.Trimesh`` that is closed and faces outward."""
+    """Load a file as a ``trimesh.Trimesh`` of closed parts, each of one orientation."""
     try:
         import trimesh
     except ImportError as error:
@@ -181,8 +256,6 @@ def _load(path: Path):
         raise ValueError(f"{path.name} is not watertight ({bad} edges without two sides); close it and export it again")
     if not shape.is_winding_consistent:
         raise ValueError(f"{path.name} has triangles of both orientations; make its normals consistent")
-    if shape.volume < 0.0:
-        shape.invert()
     return shape
 
 

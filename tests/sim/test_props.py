@@ -416,6 +416,47 @@ def test_a_hollow_body_is_hollow(trimesh, tmp_path, outward):
     assert mesh_volume(points.vertices, points.faces) == pytest.approx(points.volume.sum(), rel=1e-5)
 
 
+#: Bounds of boxes, which of them face inward, and the union's bounds of boxes that do not overlap, less a cavity.
+PARTS = {
+    "overlapping": ([[0, 0.4], [0.2, 0.6]], (), 2 * 0.4**3 - 0.2**3, 0.3),
+    "overlapping inside out": ([[0, 0.4], [0.2, 0.6]], (1,), 2 * 0.4**3 - 0.2**3, 0.3),
+    "apart inside out": ([[0, 0.4], [0.5, 0.9]], (0,), 2 * 0.4**3, 0.45),
+    "all inside out": ([[0, 0.4], [0.2, 0.6]], (0, 1), 2 * 0.4**3 - 0.2**3, 0.3),
+    "one in another": ([[0, 0.4], [0.1, 0.2]], (), 0.4**3, 0.2),
+    "a cavity": ([[0, 0.4], [0.1, 0.3]], (1,), 0.4**3 - 0.2**3, 0.2),
+}
+
+
+@pytest.mark.parametrize("name", list(PARTS))
+def test_parts_of_a_mesh_are_united(trimesh, tmp_path, name):
+    """Matter of overlapping parts counts once; a part left inside out is solid unless it lies in another."""
+    cubes, inward, volume, centre = PARTS[name]
+    shapes = [trimesh.creation.box(bounds=[[low] * 3, [high] * 3]) for low, high in cubes]
+    for index in inward:
+        shapes[index].invert()
+    path = tmp_path / "parts.stl"
+    trimesh.util.concatenate(shapes).export(path)
+    points = geometry.mesh(path, 0.05)
+    total, middle, spread = moments(points)
+    assert total == pytest.approx(volume, rel=2e-3)
+    assert np.abs(middle).max() < 1e-7
+    # particles at their places in the file: the surface moves with them
+    at = points.rest - points.vertices.min(axis=0)
+    inside = np.any([np.all((at > low - 1e-4) & (at < high + 1e-4), axis=1) for low, high in cubes], axis=0)
+    assert inside.all() and at.mean() == pytest.approx(centre, abs=5e-3)
+    # second moments of the union by inclusion and exclusion of cubes, about its centre
+    edges = np.array([high - low for low, high in cubes])
+    middles = np.array([0.5 * (low + high) for low, high in cubes]) - centre
+    weights = edges**3 * np.where([name == "a cavity" and k == 1 for k in range(2)], -1.0, 1.0)
+    along, across = weights @ (middles**2 + edges**2 / 12.0), weights @ middles**2
+    if volume < 2 * 0.4**3 and "cavity" not in name:
+        both = max(low for low, _ in cubes), min(high for _, high in cubes)
+        edge, offset = both[1] - both[0], 0.5 * sum(both) - centre
+        along, across = along - edge**3 * (offset**2 + edge**2 / 12.0), across - edge**3 * offset**2
+    expected = (across + (along - across) * np.eye(3)) / volume
+    assert spread == pytest.approx(expected, abs=0.01 * along / volume)
+
+
 def test_slivers_and_texture_seams_do_not_open_a_mesh(trimesh, tmp_path):
     # Exporters leave triangles that collapse when vertices are merged.
     vertices, faces = TETRAHEDRON
@@ -447,6 +488,10 @@ BAD_FILES = {
     "mixed.off": (
         lambda trimesh: trimesh.Trimesh(TETRAHEDRON[0], [*TETRAHEDRON[1][:2], *TETRAHEDRON[1][2:, ::-1]]),
         r"normals consistent",
+    ),
+    "sheet.off": (
+        lambda trimesh: trimesh.Trimesh(TETRAHEDRON[0][:3], [[0, 1, 2], [0, 2, 1]], process=False),
+        r"no volume",
     ),
     "shell.stl": (hollow_ball, r"spacing=0\.05 m.* spacing under 0\.025 m"),
 }
