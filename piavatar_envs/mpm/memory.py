@@ -66,10 +66,11 @@ def estimate_active_blocks(rest: np.ndarray, field: np.ndarray | None, dx: float
         if times is None:
             times = LARGE_MARGIN if len(own) > MOST_PARTICLES else ACTIVE_MARGIN
         base = np.floor(own / dx - 0.5).astype(int)
+        base -= BLOCK * (base.min(axis=0) // BLOCK)
         counts = []
         for shift in np.ndindex(2, 2, 2):  # any alignment of the grid with the body
-            touched = (base[:, None] + 2 * np.array(shift) + corners) // BLOCK
-            counts.append(len(np.unique(touched.reshape(-1, 3), axis=0)))
+            touched = (base[:, None] + 2 * np.array(shift) + corners).reshape(-1, 3).T // BLOCK
+            counts.append(np.count_nonzero(np.bincount(np.ravel_multi_index(touched, touched.max(axis=1) + 1))))
         needed += math.ceil(times * max(counts)) + 8
     return needed
 

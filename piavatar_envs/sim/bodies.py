@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import warp as wp
@@ -137,12 +138,12 @@ class Flesh:
 
     def shaped(self, parameters: np.ndarray) -> tuple[BodyPoints, np.ndarray]:
         """Return points and volumes [m^3] of one shape."""
-        body, sampled = self.asset.shape(parameters), self.sampled
-        rest, volume = morph(self.asset, sampled, body)
+        sampled = self.sampled
+        joints, rest, volume = _shape_particles(self.asset, sampled, tuple(parameters))
         points = BodyPoints(
             rest=rest[None],
             mass=self.masses(volume[None]),
-            joints=body.joints[None],
+            joints=joints[None],
             skin_joints=sampled.skin_joints,
             skin_weights=sampled.skin_weights,
             bone=sampled.bone,
@@ -279,6 +280,19 @@ def pose_control(settings: PoseControlConfig, model: Model) -> PoseControl:
     control.release_tilt_cos = math.cos(settings.release_tilt)
     control.release_distance, control.release_height = settings.release_distance, settings.release_height
     return control
+
+
+@lru_cache(maxsize=4)
+def _shape_particles(asset: AvatarAsset, sampled: ParticleSet, parameters: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+    """Return joints, rest positions and volumes of a shape, read-only: avatars and groups of environments share them.
+
+    See :meth:`AvatarAsset.shape` and :func:`~piavatar_envs.avatar.body.sampling.morph`.
+    """
+    body = asset.shape(parameters)
+    arrays = (body.joints, *morph(asset, sampled, body))
+    for array in arrays:
+        array.setflags(write=False)
+    return arrays
 
 
 def load_avatar(settings: AvatarSourceConfig) -> AvatarAsset:

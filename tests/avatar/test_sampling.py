@@ -63,20 +63,48 @@ def condition_number(points):
     return values[0] / values[2]
 
 
-def test_surface_distance_of_a_cube():
-    # Against the closed form for a unit cube about the origin, inside and outside.
+def cube():
+    """Return corners and outward oriented triangles of a unit cube about the origin."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    faces = np.array([[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)])
+    return corners.astype(np.float32), np.array([[q[0], q[k], q[k + 1]] for q in quads for k in (1, 2)])
+
+
+def test_surface_distance_of_a_cube():
+    # Against the closed form, inside and outside; most lattice points lie below or above an edge or a vertex.
+    corners, faces = cube()
     assert mesh_volume(corners, faces) == pytest.approx(1.0)
-    cube = ClosedSurface(corners.astype(np.float32), faces)
-    points = np.random.default_rng(0).uniform(-1.0, 1.0, (500, 3))
+    surface = ClosedSurface(corners, faces)
+    lattice = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = np.concatenate([np.random.default_rng(0).uniform(-1.0, 1.0, (500, 3)), lattice])
     excess = np.abs(points) - 0.5
     expected = np.linalg.norm(np.maximum(excess, 0), axis=1) + np.minimum(excess.max(axis=1), 0)
-    distance, face, coordinates = cube.query(points)
+    distance, face, coordinates = surface.query(points)
     assert np.allclose(distance, expected, atol=1e-5)
     nearest = np.einsum("pc,pci->pi", coordinates, corners[faces[face]])
     assert np.allclose(np.linalg.norm(nearest - points, axis=1), np.abs(expected), atol=1e-5)
+
+
+def test_points_in_two_limbs_are_inside():
+    # Two cubes that overlap by a half: the middle is enclosed twice, and a bubble in a cube is outside.
+    corners, faces = cube()
+    two = ClosedSurface(np.concatenate([corners, corners + [0.0, 0.0, 0.5]]), np.concatenate([faces, 8 + faces]))
+    heights = np.array([-0.6, -0.2, 0.2, 0.8, 1.2])
+    points = np.stack([np.full(5, 0.1), np.full(5, 0.2), heights], axis=1)
+    assert (two.distance(points) < 0.0).tolist() == [False, True, True, True, False]
+    hollow = ClosedSurface(np.concatenate([corners, 0.5 * corners]), np.concatenate([faces, 8 + faces[:, ::-1]]))
+    assert (hollow.distance(points) < 0.0).tolist() == [False, False, False, False, False]
+    assert hollow.distance(points[:1] + [0.0, 0.0, 0.2])[0] == pytest.approx(-0.1)
+
+
+def test_distance_near_the_surface(asset, surface):
+    low, high = asset.vertices.min(axis=0) - 0.1, asset.vertices.max(axis=0) + 0.1
+    points = np.random.default_rng(1).uniform(low, high, (20000, 3))
+    exact, near = surface.distance(points), surface.distance_near(points, 0.02)
+    within = np.abs(exact) <= 0.02
+    assert np.array_equal(near[within], exact[within])
+    assert np.array_equal(near < 0.0, exact < 0.0)
+    assert np.all(np.isinf(near) | (near == exact)) and np.isinf(near).mean() > 0.5
 
 
 def test_particles_are_inside_and_apart(surface, coarse):

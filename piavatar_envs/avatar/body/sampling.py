@@ -29,19 +29,53 @@ SMALL_BODY = 8192  # particles up to which they are in the order of their bones
 BOXES = (128, 64, 32)  # particles that lie together in larger ones, as many as P2G takes together or a warp has
 
 
+@wp.func
+def _edge_crossing(a: wp.vec3d, b: wp.vec3d):
+    """Return 1 or -1 if the edge from ``a`` to ``b`` crosses the half line from the origin along +x, and else 0.
+
+    Products of single-precision numbers are exact in double precision, so that neighbours agree on their edge.
+    """
+    side = a[0] * b[1] - a[1] * b[0]
+    zero = wp.float64(0.0)
+    if a[1] <= zero and b[1] > zero and side > zero:
+        return 1
+    if b[1] <= zero and a[1] > zero and side < zero:
+        return -1
+    return 0
+
+
+@wp.func
+def _winding_number(mesh: wp.uint64, point: wp.vec3, top: float):
+    """Return how often the skin encloses ``point``: the triangles above it, those that face downwards negative."""
+    origin = wp.vec3d(point)
+    winding = int(0)
+    face = int(0)
+    above = wp.mesh_query_aabb(mesh, point, wp.vec3(point[0], point[1], top))
+    while wp.mesh_query_aabb_next(above, face):
+        a = wp.vec3d(wp.mesh_get_point(mesh, 3 * face)) - origin
+        b = wp.vec3d(wp.mesh_get_point(mesh, 3 * face + 1)) - origin
+        c = wp.vec3d(wp.mesh_get_point(mesh, 3 * face + 2)) - origin
+        covers = _edge_crossing(a, b) + _edge_crossing(b, c) + _edge_crossing(c, a)
+        if wp.float64(covers) * wp.dot(a, wp.cross(b, c)) > wp.float64(0.0):
+            winding += covers
+    return winding
+
+
 @wp.kernel
 def _closest_point_kernel(
     mesh: wp.uint64,
+    top: float,
     points: wp.array(dtype=wp.vec3),
+    # out
     distance: wp.array(dtype=float),
     face: wp.array(dtype=int),
     coordinates: wp.array(dtype=wp.vec3),
 ):
-    """Return the signed distance (negative inside) and nearest point of the skin."""
+    """Return the signed distance (negative inside) and nearest point of the skin, which ends below ``top``."""
     i = wp.tid()
-    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0e3)
-    nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
-    distance[i] = query.sign * wp.length(nearest - points[i])
+    query = wp.mesh_query_point_no_sign(mesh, points[i], 1.0e3)
+    length = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - points[i])
+    distance[i] = wp.where(_winding_number(mesh, points[i], top) > 0, -length, length)
     face[i] = query.face
     coordinates[i] = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)
 
@@ -53,8 +87,8 @@ class ClosedSurface:
         self._mesh = wp.Mesh(
             points=wp.array(vertices, dtype=wp.vec3, device="cpu"),
             indices=wp.array(faces.ravel(), dtype=wp.int32, device="cpu"),
-            support_winding_number=True,
         )
+        self._top = float(vertices[:, 2].max()) + 1.0
 
     def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the nearest point of the skin to each of ``points`` ``(N, 3)``.
@@ -70,7 +104,7 @@ class ClosedSurface:
         wp.launch(
             _closest_point_kernel,
             dim=count,
-            inputs=[self._mesh.id, where],
+            inputs=[self._mesh.id, self._top, where],
             outputs=[distance, face, coordinates],
             device="cpu",
         )
@@ -79,6 +113,27 @@ class ClosedSurface:
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the signed distance to the skin [m], negative inside, shape ``(N,)``."""
         return self.query(points)[0]
+
+    def distance_near(self, points: np.ndarray, band: float) -> np.ndarray:
+        """Return the signed distance within ``band`` [m] of the skin, and elsewhere an infinite one; shape ``(N,)``.
+
+        Most points of a lattice are far from the skin: all of a cube are, if its centre is further than they can be.
+        """
+        found, left = np.empty(len(points)), np.arange(len(points))
+        for size in (16.0 * band, 8.0 * band, 4.0 * band, 2.0 * band):
+            cube = np.floor(points[left] / size).astype(np.int64)
+            first, count = cube.min(axis=0), np.ptp(cube, axis=0) + 1
+            cube = np.ravel_multi_index((cube - first).T, count)
+            occupied = np.flatnonzero(np.bincount(cube))
+            centres = np.stack(np.unravel_index(occupied, count), axis=1) + first + 0.5
+            distance = np.zeros(count.prod())
+            distance[occupied] = self.distance(centres * size)
+            # a little more than half a diagonal, for what single precision rounds
+            beyond = np.where(np.abs(distance) > band + 0.87 * size, np.copysign(np.inf, distance), 0.0)[cube]
+            found[left] = beyond
+            left = left[beyond == 0.0]
+        found[left] = self.distance(points[left])
+        return found
 
 
 def order_of_body(
@@ -193,7 +248,8 @@ def _conjugate_gradient(matrix: sparse.csr_matrix, right: np.ndarray, guess: np.
     inverse_diagonal = 1.0 / matrix.diagonal()[:, None]
     solution = guess.copy()
     residual = right - matrix @ solution
-    direction = z = inverse_diagonal * residual
+    z = inverse_diagonal * residual
+    direction, product = z.copy(), np.empty_like(z)
     energy = np.sum(residual * z, axis=0)
     limit = TOLERANCE * max(np.linalg.norm(right), 1e-12)
     for _ in range(MAX_ITERATIONS):
@@ -201,12 +257,13 @@ def _conjugate_gradient(matrix: sparse.csr_matrix, right: np.ndarray, guess: np.
             break
         image = matrix @ direction
         # a column that is already solved has a zero direction: leave it where it is
-        step = energy / np.maximum(np.sum(direction * image, axis=0), 1e-300)
-        solution += step * direction
-        residual -= step * image
-        z = inverse_diagonal * residual
-        new_energy = np.sum(residual * z, axis=0)
-        direction = z + (new_energy / np.maximum(energy, 1e-300)) * direction
+        step = energy / np.maximum(np.sum(np.multiply(direction, image, out=product), axis=0), 1e-300)
+        solution += np.multiply(step, direction, out=product)
+        residual -= np.multiply(step, image, out=product)
+        np.multiply(inverse_diagonal, residual, out=z)
+        new_energy = np.sum(np.multiply(residual, z, out=product), axis=0)
+        direction *= new_energy / np.maximum(energy, 1e-300)
+        direction += z
         energy = new_energy
     return solution
 
@@ -222,13 +279,14 @@ def volume_ratios(links: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.
     Returns:
         Determinants of the gradient, kept within [0.1, 10], shape ``(P,)``.
     """
-    both = np.concatenate([links, links[:, ::-1]])
-    edge = rest[both[:, 1]] - rest[both[:, 0]]
-    change = (moved - rest)[both[:, 1]] - (moved - rest)[both[:, 0]]
-    weight = 1.0 / np.maximum(np.sum(edge**2, axis=1), 1e-8)
-    spread, shear = np.zeros((len(rest), 3, 3)), np.zeros((len(rest), 3, 3))
-    np.add.at(spread, both[:, 0], np.einsum("l,li,lj->lij", weight, edge, edge))
-    np.add.at(shear, both[:, 0], np.einsum("l,li,lj->lij", weight, change, edge))
+    first, second = np.concatenate([links.T, links.T[::-1]], axis=1).astype(np.intp)
+    edge = (rest[second] - rest[first]).T
+    weight = 1.0 / np.maximum(np.sum(edge**2, axis=0), 1e-8)
+    change = ((moved - rest)[second] - (moved - rest)[first]).T
+    spread, shear = np.empty((len(rest), 3, 3)), np.empty((len(rest), 3, 3))
+    for i, j in np.ndindex(3, 3):
+        spread[:, i, j] = np.bincount(first, weight * edge[i] * edge[j], len(rest))
+        shear[:, i, j] = np.bincount(first, weight * change[i] * edge[j], len(rest))
     # Regularised, so that a point with few neighbours falls back to no change rather than to noise.
     gradient = np.eye(3) + shear @ np.linalg.inv(spread + 0.1 * np.eye(3))
     return np.clip(np.linalg.det(gradient), 0.1, 10.0)
@@ -369,8 +427,9 @@ def _flesh_lattice(asset: AvatarAsset, skin: ClosedSurface, spacing: float, seed
     counts = np.ceil((high - shift) / spacing).astype(int) - first
     cells = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, 3)
     centres = (cells + first + 0.5) * spacing + shift
-    distance = skin.distance(centres)
-    near = distance < 0.5 * np.sqrt(3.0) * spacing
+    half_diagonal = 0.5 * np.sqrt(3.0) * spacing
+    distance = skin.distance_near(centres, half_diagonal)
+    near = distance < half_diagonal
     centres, distance = centres[near], distance[near]
     steps = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS - 0.5
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * spacing
@@ -444,8 +503,8 @@ def _links(
     """
     links = cKDTree(positions).query_pairs(LINK_LENGTH * spacing, output_type="ndarray")
     links = links[np.lexsort((links[:, 1], links[:, 0]))]
-    shared = np.minimum(surface[links[:, 0]], surface[links[:, 1]]).sum(axis=1)
-    links = links[shared > 0.0]
+    joints = (surface > 0.0) @ (1 << np.arange(NUM_JOINTS))  # a bit for each
+    links = links[(joints[links[:, 0]] & joints[links[:, 1]]) != 0]
     reach = 0.5 * np.linalg.norm(positions[links[:, 0]] - positions[links[:, 1]], axis=1)
     inside = depth[links].max(axis=1) > reach  # the ball about the deeper end holds the middle
     inside[~inside] = skin.distance(positions[links[~inside]].mean(axis=1)) < 0.0
@@ -468,7 +527,7 @@ def _volumes(positions: np.ndarray, bone: np.ndarray, interior: np.ndarray, tota
 
     The particles of one bone share theirs evenly: some are closer together than the interior points.
     """
-    nearest = cKDTree(positions).query(interior)[1]
+    nearest = cKDTree(positions).query(interior, workers=-1)[1]
     share = np.bincount(nearest, minlength=len(positions)).astype(np.float64)
     for joint in range(NUM_JOINTS):
         share[bone == joint] = share[bone == joint].mean()
