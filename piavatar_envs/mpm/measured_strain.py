@@ -84,6 +84,7 @@ class MeasuredStrain:
         self.model, self.first = model, first
         self.neighbours = make_neighbours(links, count, model.device)
         self._way = wp.zeros((model.num_envs, count), dtype=wp.vec3, device=model.device)
+        self._trust = wp.zeros((model.num_envs, count), dtype=float, device=model.device)
 
     def record(self, graph: LaunchGraph, state: State, rest: wp.array, place: wp.array) -> None:
         """Append the end of a control step: correct ``F``, then positions, by a control step's share.
@@ -96,8 +97,9 @@ class MeasuredStrain:
         """
         share, dim, failure = -math.expm1(-RATE * self.model.control_dt), self._way.shape, state.failure
         inputs = [self.first, share, self.neighbours, rest, place, state.x, failure]
-        graph.launch(correct_strain, dim, inputs, [state.F])
-        inputs = [self.first, share, self.neighbours, place, self.model.particles.mass, state.x, state.F, failure]
+        graph.launch(correct_strain, dim, inputs, [state.F, self._trust])
+        mass = self.model.particles.mass
+        inputs = [self.first, share, self.neighbours, place, mass, state.x, state.F, self._trust, failure]
         graph.launch(find_hourglass_modes, dim, inputs, [self._way])
         inputs = [self.first, self.model.grid, self._way, state.u, state.vk, failure]
         graph.launch(move_particles, dim, inputs, [state.x, state.C])
@@ -121,8 +123,13 @@ def correct_strain(
     failure: wp.array(dtype=int),
     # in and out
     F: wp.array3d(dtype=float),
+    # out
+    trust: wp.array2d(dtype=float),
 ):
-    """Move ``F`` of every particle by ``share`` towards the measured one; over ``(num_envs, particles)``."""
+    """Move ``F`` of every particle by ``share`` towards the measured one, and write how far neighbours measure it.
+
+    Over ``(num_envs, particles)``.
+    """
     e, p = wp.tid()
     if failure[e] != 0:
         return
@@ -142,13 +149,14 @@ def correct_strain(
         K += wp.outer(dX, dX)
     size = wp.trace(K) / 3.0
     volume = wp.determinant(K)
-    if volume < LEAST_SPREAD * size * size * size or wp.determinant(B) < LEAST_VOLUME * volume:
-        return
-    measured = A * wp.inverse(B)
-    trust = trust_in(measured)
-    if trust > 0.0:
-        before = matrix_at(F, e, first + p)
-        store_matrix(F, e, first + p, before + (share * trust) * (measured - before))
+    own = matrix_at(F, e, first + p)
+    if not (volume < LEAST_SPREAD * size * size * size or wp.determinant(B) < LEAST_VOLUME * volume):
+        measured = A * wp.inverse(B)
+        pull = share * trust_in(measured)
+        if pull > 0.0:
+            own += pull * (measured - own)
+            store_matrix(F, e, first + p, own)
+    trust[e, p] = trust_in(own)
 
 
 @wp.kernel
@@ -160,6 +168,7 @@ def find_hourglass_modes(
     mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
     F: wp.array3d(dtype=float),
+    trust: wp.array2d(dtype=float),
     failure: wp.array(dtype=int),
     # out
     way: wp.array2d(dtype=wp.vec3),
@@ -173,7 +182,7 @@ def find_hourglass_modes(
     L = vector_at(place, s, p)
     now = vector_at(x, e, first + p)
     own = matrix_at(F, e, first + p)
-    trust = trust_in(own)
+    own_trust = trust[e, p]
     m = mass[r, first + p]
     count = neighbours.start[p + 1] - neighbours.start[p]
     total = wp.vec3()
@@ -184,7 +193,7 @@ def find_hourglass_modes(
         # symmetric in the two particles, but for the mass of the other one
         mean_count = 0.5 * float(count + neighbours.start[q + 1] - neighbours.start[q])
         other_mass = mass[r, first + q]
-        total += (wp.min(trust, trust_in(other)) * other_mass / (mean_count * (m + other_mass))) * apart
+        total += (wp.min(own_trust, trust[e, q]) * other_mass / (mean_count * (m + other_mass))) * apart
     set_vector(way, e, p, share * total)
 
 
