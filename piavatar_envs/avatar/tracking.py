@@ -54,6 +54,12 @@ def summed_second_moment(s: vec16):
 
 
 @wp.func
+def inertia_of(second: wp.mat33):
+    """Return the inertia ``tr(S) I - S`` of matter with the second moment ``S`` about the same point [kg m^2]."""
+    return wp.diag(wp.vec3(wp.trace(second))) - second
+
+
+@wp.func
 def point_inertia(mass: float, d: wp.vec3):
     """Return the inertia of a point mass at ``d``."""
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
@@ -81,8 +87,7 @@ def fit_bone(
     m = wp.max(s[0], 1.0e-12)
     d = wp.vec3(s[1], s[2], s[3]) / m
     V = wp.vec3(s[4], s[5], s[6]) / m
-    second = summed_second_moment(s) - m * wp.outer(d, d)
-    I = wp.diag(wp.vec3(wp.trace(second))) - second
+    I = inertia_of(summed_second_moment(s) - m * wp.outer(d, d))
     L = wp.vec3(s[13], s[14], s[15]) - m * wp.cross(d, V)
     bones.center[e, b] = reference[e, b] + d
     bones.velocity[e, b] = V

@@ -37,7 +37,7 @@ from piavatar_envs.avatar.skinning import unpack
 from piavatar_envs.avatar.torque_control.bone_contact import moves_bone
 from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple
-from piavatar_envs.avatar.tracking import spin_of, summed_second_moment
+from piavatar_envs.avatar.tracking import inertia_of, spin_of, summed_second_moment
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.core.arrays import vec16
 from piavatar_envs.core.cuda_intrinsics import (
@@ -487,8 +487,7 @@ def solve_fields(
     for c in range(targets.start[target], targets.start[target + 1]):
         s += fields.moments[e, c]
     d = wp.vec3(s[1], s[2], s[3]) / s[0]
-    second = summed_second_moment(s) - s[0] * wp.outer(d, d)
-    inertia = wp.diag(wp.vec3(wp.trace(second))) - second
+    inertia = inertia_of(summed_second_moment(s) - s[0] * wp.outer(d, d))
     center = origin_of(targets, x, e, target) + d
     arm = fields.arm[e, i]
     if step == 0:

@@ -11,7 +11,7 @@ import warp as wp
 from piavatar_envs.avatar.skinning import motion_at
 from piavatar_envs.avatar.torque_control.joint_motion import add_ancestors3, set_triple
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, I3, NUM_DOF
-from piavatar_envs.avatar.tracking import point_inertia, spin_of, summed_second_moment, symmetric
+from piavatar_envs.avatar.tracking import inertia_of, point_inertia, spin_of, summed_second_moment, symmetric
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import vec8, vec12, vec16
 from piavatar_envs.core.cuda_intrinsics import (
@@ -358,8 +358,7 @@ def balance(
         d = wp.vec3(s[1], s[2], s[3])  # first moment about the joint, as are the others
         w = wp.vec3(field[e, b][3], field[e, b][4], field[e, b][5])
         v = motion_at(field[e, b], arm)  # at the joint
-        second = summed_second_moment(s)
-        inertia = wp.diag(wp.vec3(wp.trace(second))) - second
+        inertia = inertia_of(summed_second_moment(s))
         p = s[0] * v + wp.cross(w, d) - reaction * wp.vec3(s[4], s[5], s[6])
         P += p
         L += wp.cross(d, v) + inertia * w - reaction * wp.vec3(s[13], s[14], s[15]) + wp.cross(arm, p)

@@ -35,7 +35,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
     lower_entries,
     set_in_arenas,
 )
-from piavatar_envs.avatar.tracking import summed_second_moment, symmetric
+from piavatar_envs.avatar.tracking import inertia_of, summed_second_moment, symmetric
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import add_rows12, add_rows16, float_at, int_at, number_at, vec12, vec16, vector_at
 from piavatar_envs.core.cuda_intrinsics import BLOCK, highest_bit, sum_threads16, sync_block, warp_threads
@@ -390,7 +390,7 @@ def fill_blocks(s: vec16, pattern: Pattern, c: int, d: int, at: wp.uint64):
     """Write the block of joints ``c`` and ``d`` of the mass matrix; with ``d`` 0 also those of the pelvis' velocity."""
     both = second_moment(s)
     own = (1 + c) * (1 + BONES)
-    set_in_arenas(at, pattern.block[own + 1 + d], wp.trace(both) * I3 - both)
+    set_in_arenas(at, pattern.block[own + 1 + d], inertia_of(both))
     if d == 0:
         set_in_arenas(at, pattern.block[own], wp.skew(wp.vec3(s[1], s[2], s[3])))  # of v_0 . (w x a), transposed
         if c == 0:
