@@ -227,6 +227,7 @@ class Forces:
         n, device = model.num_envs, model.device
         self.model, self.receivers, self._threads = model, receivers, warp_threads(device)
         self.slots = make_struct(Slots, **_columns(Slots.vars, n, SLOTS, device))
+        self._used = wp.zeros(n, dtype=int, device=device)
         self.call = make_struct(
             Call,
             mask=wp.zeros(n, dtype=wp.bool, device=device),
@@ -270,6 +271,7 @@ class Forces:
 
     def record_begin(self, graph: LaunchGraph) -> None:
         """Append the start of a control step: find the points of forces on matter, from the tracked targets."""
+        graph.launch(find_used_slots, self.model.num_envs, [self.slots.remaining], [self._used])
         for first, frame in self.receivers.frames.items():
             if first // NUM_JOINTS not in self._push:
                 graph.launch(place_points, (self.model.num_envs, SLOTS), [self.slots, first, frame], [self._fields])
@@ -278,14 +280,15 @@ class Forces:
         """Append the impulses that the joints under torque control get in this substep."""
         for index, push in self._push.items():
             first, body = NUM_JOINTS * index, self.receivers.avatars[index].body
-            inputs = [self.slots, body, first, self.model.step.dt, self.receivers.frames[first], state.failure]
+            pose, dt = self.receivers.frames[first], self.model.step.dt
+            inputs = [self.slots, self._used, body, first, dt, pose, state.failure]
             graph.launch(push_joints, (self.model.num_envs, 1 + NUM_JOINTS), inputs, [push])
 
     def record_before_substep(self, graph: LaunchGraph, state: State, step: int) -> None:
         """Append the velocity that forces on matter give in this substep, after the controllers have written theirs."""
         if not self._any_field:
             return
-        model, threads, common = self.model, self._threads, [self.slots, self._targets]
+        model, threads, common = self.model, self._threads, [self.slots, self._used, self._targets]
         n, chunks = model.num_envs, self._targets.of_chunk.shape[0]
         # a model of one velocity has the prescribed part in it
         prescribed = 0.0 if model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"]) else 1.0
@@ -373,6 +376,21 @@ def acts_on_matter(slots: Slots, held: wp.array(dtype=int), e: int, s: int):
 
 
 @wp.kernel
+def find_used_slots(
+    remaining: wp.array2d(dtype=int),
+    # out
+    used: wp.array(dtype=int),
+):
+    """Count the slots up to the last one with a force, which every substep then reads; over ``(num_envs,)``."""
+    e = wp.tid()
+    last = int(0)
+    for s in range(_SLOTS):
+        if remaining[e, s] > 0:
+            last = s + 1
+    used[e] = last
+
+
+@wp.kernel
 def place_points(
     slots: Slots,
     first: int,
@@ -391,6 +409,7 @@ def place_points(
 @wp.kernel
 def push_joints(
     slots: Slots,
+    used: wp.array(dtype=int),
     body: Body,
     first: int,
     dt: float,
@@ -407,7 +426,7 @@ def push_joints(
     if failure[e] != 0:
         return
     total = wp.vec3()
-    for s in range(_SLOTS):
+    for s in range(used[e]):
         b = slots.target[e, s] - first
         if slots.remaining[e, s] > 0 and b >= 0 and b < _JOINTS:
             if n == 0:
@@ -427,6 +446,7 @@ def origin_of(targets: Targets, x: wp.array2d(dtype=wp.vec3), e: int, target: in
 @wp.kernel
 def sum_targets(
     slots: Slots,
+    used: wp.array(dtype=int),
     targets: Targets,
     held: wp.array(dtype=int),
     particles: Particles,
@@ -444,11 +464,14 @@ def sum_targets(
     Over ``(num_envs, chunks, threads)``, a warp a chunk on a GPU.
     """
     e, c, thread = wp.tid()
+    count = used[e]
+    if count == 0 or failure[e] != 0:
+        return
     target = targets.of_chunk[c]
-    if failure[e] != 0 or held[target] != 0:
+    if held[target] != 0:
         return
     wanted = bool(False)
-    for s in range(_SLOTS):
+    for s in range(count):
         if acts_on(slots, e, s, target):
             wanted = True
     if not wanted:
@@ -467,6 +490,7 @@ def sum_targets(
 @wp.kernel
 def solve_fields(
     slots: Slots,
+    used: wp.array(dtype=int),
     targets: Targets,
     dt: float,
     step: int,
@@ -480,7 +504,9 @@ def solve_fields(
     Then the arm turns with the target, for the next substep.
     """
     e, i = wp.tid()
-    if failure[e] != 0 or not acts_on_matter(slots, fields.held, e, i):
+    if i >= used[e] or failure[e] != 0:
+        return
+    if not acts_on_matter(slots, fields.held, e, i):
         return
     target = slots.target[e, i]
     s = vec16()
@@ -503,6 +529,7 @@ def solve_fields(
 @wp.kernel(launch_bounds=(BLOCK, 8))
 def accelerate(
     slots: Slots,
+    used: wp.array(dtype=int),
     targets: Targets,
     fields: Fields,
     x: wp.array2d(dtype=wp.vec3),
@@ -515,9 +542,10 @@ def accelerate(
     threads = threads_of_environment(x.shape[0])
     own = first_particle(i, threads)
     e = own[0]
-    if failure[e] != 0:
+    count = used[e]
+    if count == 0 or failure[e] != 0:
         return
-    for s in range(_SLOTS):
+    for s in range(count):
         if acts_on_matter(slots, fields.held, e, s):
             target = slots.target[e, s]
             p = own[1]
