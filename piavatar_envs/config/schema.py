@@ -12,6 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from piavatar_envs.avatar.body.flesh_stiffness import FREE_SHARE
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.body.sources import check_source
 from piavatar_envs.config.load import ConfigError, load_config
@@ -249,6 +250,13 @@ class TorqueControlConfig(BaseModel):
     strength: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the greatest torques of the joints [-]")
     flesh_rate: RateRange = Field(
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
+    )
+    flesh_resistance: float = Field(
+        FREE_SHARE,
+        ge=0.0,
+        le=10.0,
+        description="resistance of flesh to bent joints, over that of flesh held exactly at its skinned places; 0.25 "
+        "is that of flesh which gives way to its stress, 0 none [-]",
     )
     firm_bones: bool = Field(
         True,

@@ -16,6 +16,7 @@ import warp as wp
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
+from piavatar_envs.avatar.body.flesh_stiffness import flesh_stiffness
 from piavatar_envs.avatar.body.muscles import make_muscles
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
@@ -184,6 +185,18 @@ class Flesh:
         if control.mode == "pose":
             return None
         sampled = self.sampled
+        matter, points = self.matter(), self._points
+        mu, lam = lame_parameters(matter.young_modulus[0], matter.poisson_ratio[0])
+        stiffness = flesh_stiffness(
+            points.rest[0],
+            self._volume[0],
+            points.joints[0],
+            sampled.links,
+            sampled.skin_joints,
+            sampled.skin_weights,
+            mu,
+            lam,
+        )
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)
         return TorqueControl(
@@ -193,6 +206,7 @@ class Flesh:
             firm_bones=(sampled.bone >= 0) & control.firm_bones,
             links=sampled.links,
             bone_contact=control.bone_contact,
+            flesh_stiffness=control.flesh_resistance * stiffness,
         )
 
     def masses(self, volume: np.ndarray) -> np.ndarray:

@@ -1,10 +1,9 @@
-"""Joints that push: what a blocked limb transmits, what limits and ends of ranges do, how flesh is held."""
+"""Joints that push: what a blocked limb transmits, what limits do, how flesh is held."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness
@@ -12,7 +11,8 @@ from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
-from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, stopping_torque
+from piavatar_envs.avatar.torque_control.joint_tissue import JointTissue
+from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED
 from tests.avatar.articulated import Joints
 
 ANKLES = [joint_index("left_ankle"), joint_index("right_ankle")]
@@ -35,8 +35,7 @@ class Held(Joints):
         self.body = ArticulatedBody(
             rig.points, rig.avatar.body, rig.model, springs, dampers, np.full((1, len(rig.mass)), 300.0)
         )
-        nothing = np.zeros(NUM_JOINTS)
-        self.body.set_tissue(nothing, nothing, -EVERYWHERE, EVERYWHERE, TOES)
+        self.body.set_tissue(JointTissue(np.zeros(NUM_JOINTS), -EVERYWHERE, EVERYWHERE, TOES))
 
     def start(self):
         """Start in the rest pose, where the pelvis is held."""
@@ -134,63 +133,6 @@ def test_no_muscle_gives_more_where_others_have_been_cut(make_rig):
     assert held.state.failure.numpy().sum() == 0
     assert 4 <= np.median(cut) <= len(moving) - 4  # some are, and some are not
     assert max(excess) < 1.001
-
-
-@wp.kernel
-def stop_at(local: wp.array(dtype=wp.quat), lower: wp.vec3, upper: wp.vec3, torque: wp.array(dtype=wp.vec3)):
-    i = wp.tid()
-    torque[i] = stopping_torque(local[i], lower, upper)
-
-
-def test_the_end_of_a_range_gives_back_what_it_takes(device):
-    # Its torque is the gradient of half the square of how far a joint is beyond, however it is bent.
-    rng = np.random.default_rng(5)
-    lower, upper = np.array([-0.2, -0.3, -0.1]), np.array([2.2, 0.2, 0.3])
-    vectors = rng.uniform([-0.6, -0.8, -0.8], [2.4, 0.8, 0.8], (200, 3))
-    vectors[:3] = [[0.1, 0.0, 0.1], [1e-4, -0.3 - 1e-4, 0.0], [2.3, 0.27, 0.0]]
-    local = Rotation.from_rotvec(vectors)
-
-    def energy(rotations):
-        v = rotations.as_rotvec()
-        return 0.5 * ((np.clip(v, lower, upper) - v) ** 2).sum(1)
-
-    turn = 1e-5
-    by_axis = [
-        (energy(Rotation.from_rotvec(-turn * axis) * local) - energy(Rotation.from_rotvec(turn * axis) * local))
-        for axis in np.eye(3)
-    ]
-    expected = np.stack(by_axis, 1) / (2.0 * turn)
-    torque = wp.zeros(len(vectors), dtype=wp.vec3, device=device)
-    at = wp.array(local.as_quat().astype(np.float32), dtype=wp.quat, device=device)
-    wp.launch(stop_at, len(vectors), [at, wp.vec3(*lower), wp.vec3(*upper)], [torque], device=device)
-    assert (np.abs(expected).max(1) > 0.1).sum() > 100 and not expected[0].any()
-    np.testing.assert_allclose(torque.numpy(), expected, atol=2e-5)
-
-
-def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
-    # A torque of 10 N m turns an elbow out of its range by what its stop gives, no further; it does not rebound.
-    elbows = [joint_index("left_elbow"), joint_index("right_elbow")]
-    held = Held(make_rig(cells=16), elbows, 0.0, 0.5)
-    lower, upper, stop = -EVERYWHERE.copy(), EVERYWHERE.copy(), np.zeros(NUM_JOINTS)
-    upper[elbows], stop[elbows] = 0.3, 200.0
-    nothing = np.zeros(NUM_JOINTS)
-    held.body.set_tissue(nothing, stop, lower, upper, TOES)
-    held.start()
-    torque = np.zeros((1, NUM_JOINTS, 3), np.float32)
-    torque[0, elbows, 0] = 10.0
-    held.body.state.torque.assign(torque)
-    for _ in range(40):
-        held.graph.run()
-    np.testing.assert_allclose(held.local()[:, 0], 0.3 + 10.0 / 200.0, atol=0.01)
-    # let go, it creeps back into its range: what stops it damps it, too, by 0.03 s of its stiffness
-    held.body.state.torque.zero_()
-    held.graph.run()
-    beyond = [held.local()[:, 0] - 0.3]
-    for _ in range(3):
-        held.graph.run()
-        beyond.append(held.local()[:, 0] - 0.3)
-    remains = np.exp(-held.model.control_dt / 0.03)
-    np.testing.assert_allclose(np.array(beyond[1:]) / beyond[:-1], remains, rtol=0.25)
 
 
 def test_flesh_is_held_the_faster_the_deeper_it_lies():

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body import device as body_device
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
+from piavatar_envs.avatar.torque_control.joint_tissue import JointTissue
 from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.torque_control.stages import FIT_SHARE
@@ -205,7 +206,7 @@ def test_flesh_comes_back_to_the_bones(make_rig):
     # Displaced flesh in empty space: at a rate of 100/s nothing is left of it after 0.4 s.
     made = Joints(make_rig(cells=16), stiffness=300.0, damping=10.0, attachment=100.0)
     nothing, everywhere = np.zeros(NUM_JOINTS), np.full((NUM_JOINTS, 3), UNBOUNDED)
-    made.body.set_tissue(nothing, nothing, -everywhere, everywhere, TOES)  # too light for so large cells
+    made.body.set_tissue(JointTissue(nothing, -everywhere, everywhere, TOES))  # too light for so large cells
     made.pose(np.zeros((NUM_JOINTS, 3)))
     rng, dt = np.random.default_rng(0), made.model.step.dt
     rest = made.rig.read("x")

@@ -17,6 +17,7 @@ from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.tasks.games.sumo import SumoTask
+from tests.sim.tissue import tissue_torques
 
 REACH = "PIAvatar/Reach-v0"
 PD = {"control": "pd", "pose_noise": 0.0, "firm_bones": True}
@@ -251,21 +252,21 @@ def spring_torques(batch) -> np.ndarray:
 
 
 def test_a_joint_at_rest_bears_the_weight_that_hangs_on_it(make_batch):
-    # Springs give exactly its moment: the grid's inertia in light joints resists no load that stays.
+    # Springs and tissue give exactly its moment: the grid's inertia in light joints resists no load that stays.
     batch = make_batch(REACH, 1, control="pd", pose_noise=0.0, root_assist=1.0, joints=None, scene=EMPTY["scene"])
     batch.reset(seeds=[0])
     for _ in range(150):
         batch.step()
-    spring, weight = spring_torques(batch), weight_about_joints(batch)
+    held, weight = spring_torques(batch) + tissue_torques(batch), weight_about_joints(batch)
     moving = [b for b in range(1, len(PARENTS)) if batch.simulation.controllers[0].joints.tissue.lock.numpy()[b] == 0.0]
     assert len(moving) == len(PARENTS) - 3  # toes are locked
     assert np.linalg.norm(weight[moving], axis=1).min() > 0.05
-    np.testing.assert_allclose(spring[moving], -weight[moving], rtol=0.003, atol=0.01)
+    np.testing.assert_allclose(held[moving], -weight[moving], rtol=0.003, atol=0.01)
 
 
 @pytest.mark.parametrize("name", ["ankle", "knee"])
 def test_legs_bear_what_stands_on_them(make_batch, name):
-    # Feet press the ground, and springs give the moment of all above a joint: its weight and what holds the pelvis.
+    # Feet press the ground; springs and tissue give the moment of all above a joint: weight and what holds the pelvis.
     batch = make_batch(REACH, 1, control="pd", pose_noise=0.0, root_assist=1.0, joints=None, episode_seconds=20.0)
     batch.reset(seeds=[0])
     for _ in range(100):
@@ -281,7 +282,7 @@ def test_legs_bear_what_stands_on_them(make_batch, name):
     held = pelvis.torque.numpy()[0] + np.cross(at[0] - axis, pelvis.force.numpy()[0])
     above = weight - weight_about_joints(batch)[joints].sum(0) + held
     assert above[0] > 15.0  # [N m]
-    assert spring_torques(batch)[joints, 0].sum() == pytest.approx(above[0], rel=0.04)
+    assert (spring_torques(batch) + tissue_torques(batch))[joints, 0].sum() == pytest.approx(above[0], rel=0.04)
 
 
 @pytest.mark.parametrize("firm", [False, True])

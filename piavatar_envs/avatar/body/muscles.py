@@ -69,10 +69,6 @@ DAMPING_TIME = 0.1
 FASTEST = 20.0
 #: Damping of tissue over the greatest torque of a joint [s].
 TISSUE_TIME = 0.005
-#: A joint is stopped by its greatest torque at this angle beyond its range [rad].
-STOP_ANGLE = 0.2
-#: How far beyond the range that actions command tissue begins to stop a joint [rad].
-SLACK = 0.09
 
 
 def joint_torques() -> tuple[np.ndarray, np.ndarray]:
@@ -89,8 +85,7 @@ class Muscles:
         damping: of the same [N m s/rad].
         lower, upper: greatest torques [N m].
         tissue_damping: of a joint at rest [N m s/rad].
-        stop: stiffness beyond the range [N m/rad].
-        range_lower, range_upper: where tissue begins to stop a joint [rad].
+        range_lower, range_upper: ends of the ranges [rad].
     """
 
     stiffness: np.ndarray
@@ -98,7 +93,6 @@ class Muscles:
     lower: np.ndarray
     upper: np.ndarray
     tissue_damping: np.ndarray
-    stop: np.ndarray
     range_lower: np.ndarray
     range_upper: np.ndarray
 
@@ -125,9 +119,8 @@ def make_muscles(stiffness: float = 1.0, damping: float = 1.0, strength: float =
         lower=strength * lower,
         upper=strength * upper,
         tissue_damping=TISSUE_TIME * most,
-        stop=most / STOP_ANGLE,
-        range_lower=range_lower - SLACK,
-        range_upper=range_upper + SLACK,
+        range_lower=range_lower,
+        range_upper=range_upper,
     )
 
 

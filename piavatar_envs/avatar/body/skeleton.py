@@ -6,10 +6,16 @@ joint ``b``. World axes: metres, right-handed, z up; in the rest pose the avatar
 
 Ranges of the joints: bounds on the rotation vector of every joint relative to the rest pose.
 
-The rest pose stands with the arms lowered by some 45 degrees, so the ranges of the arms are those of an adult counted
-from there. Axes are the world's in the rest pose: +x to the left, -y forward, +z up. Values follow the ranges of motion
-of the American Academy of Orthopaedic Surgeons (Greene & Heckman, "The Clinical Measurement of Joint Motion", 1994),
-rounded to 5 degrees and split evenly over the joints of the spine.
+The rest pose stands with the arms lowered by some 45 degrees and elbows bent by as much, so the ranges of the arms are
+those of an adult counted from there. Axes are the world's in the rest pose: +x to the left, -y forward, +z up. Values
+follow the ranges of motion of the American Academy of Orthopaedic Surgeons (Greene & Heckman, "The Clinical Measurement
+of Joint Motion", 1994), rounded to 5 degrees. Those of the trunk, 80 and 30 degrees of flexion and extension, 35 of
+lateral bending, 45 of axial rotation, are sums over the three joints of the spine: for the lower lumbar spine, for its
+upper part with the lowest thoracic vertebrae, and for the thorax. Lumbar segments bend by some 14 degrees each in the
+sagittal plane, more in flexion than in extension (Pearcy, Portek & Shepherd, "Three-dimensional x-ray analysis of
+normal movement in the lumbar spine", Spine 9 (1984), pp. 294-297), and hardly rotate, which the thorax does; how the
+sums are split further is an *estimate*. Those of the neck are split evenly over its two joints. Ankles bend up by 30
+degrees, as under the weight of a body that leans forward (an *estimate*), not by the 20 of an unloaded foot.
 
 Limb groups: the parts of a body that move through the grid apart, so that an arm can touch the belly.
 """
@@ -135,21 +141,20 @@ def skin(
 Bounds = tuple[tuple[float, float], ...]
 
 # Degrees about x (bending forward is positive for the trunk, backward for hip and knee), y and z, for the left side.
-_SPINE = ((-10.0, 30.0), (-15.0, 15.0), (-15.0, 15.0))
 _LEFT_DEGREES: dict[str, Bounds] = {
     "hip": ((-120.0, 30.0), (-45.0, 30.0), (-45.0, 45.0)),
     "knee": ((-5.0, 140.0), (-5.0, 5.0), (-15.0, 15.0)),
-    "ankle": ((-20.0, 50.0), (-30.0, 20.0), (-20.0, 20.0)),
+    "ankle": ((-30.0, 50.0), (-30.0, 20.0), (-20.0, 20.0)),
     "foot": ((-40.0, 40.0), (-5.0, 5.0), (-5.0, 5.0)),
     "collar": ((-10.0, 10.0), (-30.0, 10.0), (-20.0, 20.0)),
     "shoulder": ((-120.0, 60.0), (-120.0, 50.0), (-90.0, 90.0)),
-    "elbow": ((-140.0, 20.0), (-60.0, 60.0), (-140.0, 20.0)),
+    "elbow": ((-140.0, 30.0), (-60.0, 60.0), (-140.0, 30.0)),
     "wrist": ((-70.0, 70.0), (-70.0, 70.0), (-70.0, 70.0)),
 }
 _CENTER_DEGREES: dict[str, Bounds] = {
-    "spine1": _SPINE,
-    "spine2": _SPINE,
-    "spine3": _SPINE,
+    "spine1": ((-10.0, 30.0), (-12.0, 12.0), (-5.0, 5.0)),
+    "spine2": ((-10.0, 30.0), (-12.0, 12.0), (-10.0, 10.0)),
+    "spine3": ((-10.0, 20.0), (-11.0, 11.0), (-30.0, 30.0)),
     "neck": ((-30.0, 25.0), (-20.0, 20.0), (-40.0, 40.0)),
     "head": ((-30.0, 25.0), (-20.0, 20.0), (-40.0, 40.0)),
 }

@@ -26,11 +26,13 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
 
    For light joints inertia is added for the projection only; the torque solve omits it
    (:func:`~piavatar_envs.avatar.torque_control.mass_matrix.grid_inertia`).
-4. *Torques*, springs, tissue and bone contact, implicit in time
+4. *Torques*, springs, tissue, ends of ranges and bone contact, implicit in time
    (:mod:`~piavatar_envs.avatar.torque_control.joint_torques`,
+   :mod:`~piavatar_envs.avatar.torque_control.joint_tissue`,
+   :mod:`~piavatar_envs.avatar.torque_control.joint_stops`,
    :mod:`~piavatar_envs.avatar.torque_control.bone_contact`)::
 
-       (M + A) d = dt (K e + tau) + J_b^T p + J_f^T F dt - A (qdot + c),   A = dt D + dt^2 K
+       (M + A) d = dt (K e + tau) + J_b^T p + N s + J_f^T F dt - A (qdot + c),   A = dt D + dt^2 K
 
    Torques between bones must change neither momentum nor angular momentum. Because ``M`` may be a few substeps old, the
    rigid motion that ``J d`` has in excess is subtracted, computed from the current moments of the bones.
@@ -45,7 +47,7 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
    (:func:`~piavatar_envs.avatar.torque_control.flesh_coupling.split_velocity`). Its difference from ``J qdot`` goes to
    ``u``.
 6. *Fit*, after a new mass matrix: the pose is moved by a share of ``M^-1 J^T m (x - LBS)``, with the particles'
-   displacements from their skinned places ``LBS`` at the beginning of the substep.
+   displacements from their skinned places ``LBS`` at the beginning of the substep, but no joint beyond its range.
 
 After a control step, ``F`` approaches the strain measured against the skinned places, and hourglass modes of the
 particles are taken back (:mod:`~piavatar_envs.mpm.measured_strain`). Then
@@ -64,6 +66,7 @@ Symbols:
 ``A``        implicit inertia of springs and dampers
 ``tau``      torques of the joints
 ``p, J_b``   impulses on points of bones that touch a boundary, and the Jacobian of these points
+``s, N``     impulses of the stops at the ends of ranges, and their directions
 ``F, J_f``   external forces (:mod:`piavatar_envs.sim.forces`), and the Jacobian of the points where they act
 ``d``        velocity change by step 4
 ``h``        bias forces: centripetal and Coriolis forces of the bones at constant ``qdot``
@@ -81,7 +84,6 @@ Limits:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -92,7 +94,8 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.segment_sums import ALL_WORDS, PARTITION_THREADS, sum_moments, warps_of
 from piavatar_envs.avatar.torque_control.bone_contact import Ground
 from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, find_places, put_in_place, split_velocity
-from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
+from piavatar_envs.avatar.torque_control.joint_tissue import JointTissue, make_tissue
+from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, Springs, Target, make_strength
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, MassMatrix, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
@@ -188,7 +191,7 @@ class ArticulatedBody:
         self._workspace = self._allocate()
         without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
         self.set_strength(-everywhere, everywhere, 1)
-        self.set_tissue(without[:, 0], without[:, 0], -everywhere, everywhere, [])
+        self.set_tissue(JointTissue(without[:, 0], -everywhere, everywhere, []))
 
     def _allocate(self) -> TorqueWorkspace:
         """Return the zeroed arrays of a substep."""
@@ -232,11 +235,9 @@ class ArticulatedBody:
         """Limit the torques of the joints, see :func:`make_strength`; call it before anything is recorded."""
         self.strength = make_strength(lower, upper, rows, self.model.device)
 
-    def set_tissue(
-        self, damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int]
-    ) -> None:
-        """Set the passive resistance, see :func:`make_tissue`; call it before anything is recorded."""
-        self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
+    def set_tissue(self, tissue: JointTissue) -> None:
+        """Set the passive resistance; call it before anything is recorded."""
+        self.tissue = make_tissue(tissue, self.model.device)
         besides = np.r_[np.zeros(3), np.repeat(self._inertia + self.tissue.lock.numpy(), 3)]
         own = self._workspace.diagonals[: self.model.num_envs]
         own.assign(np.broadcast_to(besides.astype(np.float32), own.shape))
@@ -269,7 +270,7 @@ class ArticulatedBody:
         """Append the mass matrix from the bones' moments, and its factors."""
         self.mass.record_sums(graph, state, self.state.position)
         threads = int(MASS_BLOCK) if self.threads > 1 else 1
-        inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure]
+        inputs = [self.body, self.mass.pairs, self.model.step.dt, self.target, self.springs, self.tissue, state.failure]
         graph.launch(build_mass, (self.model.num_envs, threads), inputs, [self._workspace], block_dim=threads)
 
     def _record_stage(self, graph: LaunchGraph, stage: wp.Kernel, inputs: list, state: State, *more: Any) -> None:

@@ -21,10 +21,12 @@ from piavatar_envs.avatar.body.muscles import (
     Muscles,
     spring_rows,
 )
+from piavatar_envs.avatar.body.passive import passive_moments
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple
+from piavatar_envs.avatar.torque_control.joint_tissue import JointTissue
 from piavatar_envs.avatar.torque_control.joint_torques import Springs, Target
 from piavatar_envs.avatar.torque_control.stages import Support
 from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose, allocate
@@ -55,6 +57,7 @@ class TorqueControl:
         firm_bones: particles that are moved to their skinned places after every control step, ``(P,)`` bool.
         links: pairs of neighbouring particles, from which strain is measured, shape ``(L, 2)``.
         bone_contact: whether bones stop at boundaries.
+        flesh_stiffness: of the joints by their flesh, shape ``(22, 3, 22, 3)`` [N m/rad].
     """
 
     muscles: Muscles
@@ -63,6 +66,7 @@ class TorqueControl:
     firm_bones: np.ndarray
     links: np.ndarray
     bone_contact: bool
+    flesh_stiffness: np.ndarray
 
 
 @wp.kernel
@@ -190,9 +194,11 @@ class TorqueController:
             points, avatar.body, model, rows, rows, *flesh, parameters.bone_contact, parameters.links
         )
         self.joints.set_strength(muscles.lower, muscles.upper, n)
-        ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]
-        self.joints.set_tissue(muscles.tissue_damping, muscles.stop, *ranges, locked)
+        ranges = muscles.range_lower, muscles.range_upper
+        self.joints.set_tissue(
+            JointTissue(muscles.tissue_damping, *ranges, locked, passive_moments(), parameters.flesh_stiffness)
+        )
         state = avatar.state
         self.joints.support = make_struct(Support, force=state.wrench_force, torque=state.wrench_torque)
         self.joints.target = make_struct(

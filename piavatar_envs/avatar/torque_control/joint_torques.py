@@ -16,13 +16,18 @@ system is solved again, so that all other joints respond to it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.rotation import quat_log, short_of_pi, torque_of_vector
+from piavatar_envs.avatar.rotation import quat_log, torque_of_vector
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple, triple_of
+from piavatar_envs.avatar.torque_control.joint_tissue import (
+    Tissue,
+    above,
+    tissue_damping,
+    tissue_pull,
+    tissue_stiffness,
+)
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.core.structs import make_struct
@@ -33,10 +38,6 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: A bound that is never reached.
 UNBOUNDED = 1.0e30
-#: Inertia of a locked joint, far above that of any body [kg m^2].
-LOCK = 1.0e6
-#: Damping over stiffness of the stop at the end of a joint's range [s].
-STOP_TIME = wp.constant(0.03)
 
 
 @wp.struct
@@ -70,17 +71,6 @@ class Strength:
     factor: wp.array(dtype=float)  # (1 or num_envs,) on both [-]
 
 
-@wp.struct
-class Tissue:
-    """Passive resistance of the joints: slight damping, and stiff stops at the ends of their ranges; ``(bones,)``."""
-
-    damping: wp.array(dtype=float)  # [N m s/rad]
-    stop: wp.array(dtype=float)  # stiffness beyond the range [N m/rad]
-    lower: wp.array(dtype=wp.vec3)  # range of the rotation vector relative to the rest pose [rad]
-    upper: wp.array(dtype=wp.vec3)
-    lock: wp.array(dtype=float)  # inertia of locked joints, else 0 [kg m^2]
-
-
 def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) -> Strength:
     """Upload limits of the torques, each ``(22, 3)`` [N m], with a factor of 1 on them in ``rows`` rows."""
     return make_struct(
@@ -91,28 +81,6 @@ def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) 
     )
 
 
-def make_tissue(
-    damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int], device: str
-) -> Tissue:
-    """Upload the passive resistance of the joints.
-
-    Args:
-        damping: of all joints, shape ``(22,)`` [N m s/rad].
-        stop: stiffness beyond their ranges, shape ``(22,)`` [N m/rad].
-        lower: of the ranges of the rotation vectors, shape ``(22, 3)`` [rad].
-        upper: likewise.
-        locked: joints that do not move: the bones beyond them are rigid extensions of their parents.
-        device: Warp device.
-    """
-    lock = np.zeros(len(damping))
-    lock[list(locked)] = LOCK
-    numbers = {"damping": damping, "stop": stop, "lock": lock}
-    arrays = {name: wp.array(v.astype(np.float32), dtype=float, device=device) for name, v in numbers.items()}
-    for name, bound in (("lower", lower), ("upper", upper)):
-        arrays[name] = wp.array(bound.astype(np.float32), dtype=wp.vec3, device=device)
-    return make_struct(Tissue, **arrays)
-
-
 @wp.func
 def implicit_inertia(dt: float, stiffness: float, damping: float):
     """Return ``A = dt D + dt^2 K``: the inertia of a spring and a damper, implicit in time."""
@@ -120,64 +88,29 @@ def implicit_inertia(dt: float, stiffness: float, damping: float):
 
 
 @wp.func
-def resistance(tissue: Tissue, stop: float, b: int):
-    """Return the damping of tissue, with that of the ``stop`` where the joint is beyond its range [N m s/rad]."""
-    return tissue.damping[b] + STOP_TIME * stop
-
-
-@wp.func
-def above(body: Body, rotation: wp.array2d(dtype=wp.quat), e: int, b: int):
-    """Return the rotation of a bone's parent; the pelvis has the world as its parent."""
-    if b == 0:
-        return wp.quat(0.0, 0.0, 0.0, 1.0)
-    return rotation[e, body.parent[b]]
-
-
-@wp.func
-def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
-    """Return the change of the rotation vector that leads back into the range [rad]; zero within it.
-
-    The range ends before half a turn, even at the corners of the box: there rotation vectors jump, and a stop would
-    push outwards.
-    """
-    v = quat_log(local)
-    return short_of_pi(wp.max(lower, wp.min(v, upper))) - v
-
-
-@wp.func
-def stopping_torque(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
-    """Return the torque of the stop over its stiffness, in the frame of the parent [rad].
-
-    It is conservative: the gradient of half the square of :func:`beyond`.
-    """
-    return torque_of_vector(quat_log(local), beyond(local, lower, upper))
-
-
-@wp.func
 def implicit_diagonal(
     body: Body,
     dt: float,
-    pose: Pose,
+    target: Target,
     springs: Springs,
     tissue: Tissue,
+    bend: wp.array2d(dtype=wp.vec3),
     e: int,
     n: int,
     into: int,
     # out
-    stop: wp.array2d(dtype=float),
+    stiffness: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
 ):
-    """Write ``A``, and the stop stiffness (0 within the range); ``n`` 0 is the pelvis' position, joints follow."""
+    """Write ``A``, and the stiffness of the tissue in it; ``n`` 0 is the pelvis' position, joints follow."""
     r = row(e, springs.stiffness.shape[0])
     value = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
     if n > 1:
         b = n - 1
-        local = wp.quat_inverse(pose.rotation[e, body.parent[b]]) * pose.rotation[e, b]
-        stiff = float(0.0)
-        if wp.length(beyond(local, tissue.lower[b], tissue.upper[b])) > 0.0:
-            stiff = tissue.stop[b]
-        stop[e, b] = stiff
-        value += implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) + tissue.lock[b]
+        factor = target.factor[row(e, target.factor.shape[0])]
+        K = tissue_stiffness(tissue, bend, factor, e, b)
+        stiffness[e, b] = K
+        value += implicit_inertia(dt, K, tissue_damping(tissue, K, factor, b)) + tissue.lock[b]
     set_triple(diagonal, into, 3 * n, wp.vec3(value))
 
 
@@ -189,7 +122,8 @@ def joint_impulse(
     target: Target,
     springs: Springs,
     tissue: Tissue,
-    stop: wp.array2d(dtype=float),
+    bend: wp.array2d(dtype=wp.vec3),
+    stiffness: wp.array2d(dtype=float),
     q: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
     e: int,
@@ -215,10 +149,12 @@ def joint_impulse(
         local = wp.quat_inverse(frame) * pose.rotation[e, b]
         push = K * quat_log(target.rotation[e, b] * wp.quat_inverse(local))
         if b > 0:
-            push += target.factor[row(e, target.factor.shape[0])] * target.torque[e, b]
-            stiff = stop[e, b]
-            passive = dt * stiff * wp.quat_rotate(frame, stopping_torque(local, tissue.lower[b], tissue.upper[b]))
-            passive -= implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) * v
+            factor = target.factor[row(e, target.factor.shape[0])]
+            push += factor * target.torque[e, b]
+            pull = torque_of_vector(bend[e, b], tissue_pull(tissue, bend, factor, e, b))
+            passive = dt * wp.quat_rotate(frame, pull)
+            damping = tissue_damping(tissue, stiffness[e, b], factor, b)
+            passive -= implicit_inertia(dt, stiffness[e, b], damping) * v
         active = dt * wp.quat_rotate(frame, push)
     active -= implicit_inertia(dt, K, springs.damping[r, n]) * v
     set_triple(muscle, e, 3 * n, active)

@@ -26,11 +26,18 @@ from piavatar_envs.avatar.torque_control.joint_momentum import (
     predict_velocity,
 )
 from piavatar_envs.avatar.torque_control.joint_motion import move_joints, set_triple, spread_motion, triple_of
+from piavatar_envs.avatar.torque_control.joint_stops import (
+    finish_stops,
+    hold_joint,
+    joint_inertia,
+    release_joints,
+    stay_in_range,
+)
+from piavatar_envs.avatar.torque_control.joint_tissue import Tissue, bend_of
 from piavatar_envs.avatar.torque_control.joint_torques import (
     Springs,
     Strength,
     Target,
-    Tissue,
     final_impulses,
     implicit_diagonal,
     joint_impulse,
@@ -39,8 +46,10 @@ from piavatar_envs.avatar.torque_control.joint_torques import (
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, PLACES, Pairs, compose_mass, record_arena
 from piavatar_envs.avatar.torque_control.tree_cholesky import (
     ARENA_WORDS,
+    add_blocks,
     factorize,
     factorize_in_arena,
+    load_arena,
     load_factor,
     place_of_factor,
     solve,
@@ -71,7 +80,7 @@ WARP = wp.constant(32)
 MASS_BLOCK = wp.constant(128)
 _ARENA_WORDS = wp.constant(ARENA_WORDS)
 #: Most repeated solutions in a substep: a muscle at its limit changes the load of the others.
-MOST_CUTS = wp.constant(4)
+MOST_CUTS = wp.constant(8)
 #: Share of the deviation between pose and particles that one fit removes. Particles of fast, light joints (head, hands)
 #: also deviate for other reasons, so that following them at once would destabilise these joints.
 FIT_SHARE = 0.2
@@ -125,7 +134,9 @@ def find_shares(
 
 
 @wp.func
-def advance_pose(body: Body, dt: float, move: int, off: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
+def advance_pose(
+    body: Body, dt: float, tissue: Tissue, move: int, off: int, e: int, thread: int, threads: int, w: TorqueWorkspace
+):
     """Advance the pose by half a substep (moves 0 and 1), or fit it to the particles (move 2).
 
     The fit is a share of ``dq = M^-1 J^T m way``, with the displacements ``way`` from particles to their places, in row
@@ -137,6 +148,8 @@ def advance_pose(body: Body, dt: float, move: int, off: int, e: int, thread: int
         spread_motion(body, w.pose.position, w.velocity, e, e, thread, threads, w.moving)
     else:
         time = -_FIT_SHARE
+        for b in range(1 + thread, BONES, threads):
+            stay_in_range(body, time, w.pose, tissue, off, e, b, w.shares)
         spread_motion(body, w.pose.position, w.shares, off, e, thread, threads, w.moving)
     if move == 1:
         store_spin(w.moving, e, thread, threads, w.steps)
@@ -155,10 +168,19 @@ def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: Torqu
 
 
 @wp.func
+def bend_joints(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
+    """Compute the rotation vectors of all joints."""
+    for b in range(thread, BONES, threads):
+        w.bend[e, b] = bend_of(body, w.pose, e, b)
+    sync_block()
+
+
+@wp.func
 def limit_joints(
     body: Body,
     dt: float,
     springs: Springs,
+    tissue: Tissue,
     strength: Strength,
     driven: int,
     own: int,
@@ -168,18 +190,24 @@ def limit_joints(
     threads: int,
     w: TorqueWorkspace,
 ) -> float:
-    """Limit the impulses of the muscles at share ``own``; return to all threads the number of newly limited ones.
+    """Limit the impulses of the muscles at share ``own``, and hold joints at the ends of their ranges.
 
-    With ``again``, joints already limited are skipped.
+    Returns to all threads the number of joints for which either has changed. With ``again``, muscles already limited
+    are skipped.
     """
-    limited = float(0.0)
+    changed = float(0.0)
     for k in range(thread, TRIPLES, threads):
         rest = w.diagonals[driven, 3 * k]
-        limited += limit_torque(
+        changed += limit_torque(
             body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, again, e, k, w.impulse, w.left
         )  # fmt: skip
+        if k > 1 and tissue.lock[wp.max(k - 1, 0)] == 0.0:
+            inertia = joint_inertia(w.pattern, w.matrix, w.left[e, 3 * k], e, k)
+            changed += hold_joint(
+                body, dt, w.pose, tissue, inertia, w.velocity, w.outside, w.shares, own, e, k - 1, w.stops, w.impulse
+            )  # fmt: skip
     sync_threads(threads)
-    return sum_threads(limited, threads)
+    return sum_threads(changed, threads)
 
 
 @wp.func
@@ -213,25 +241,44 @@ def apply_torques(
     ``driven`` is the factor of the mass matrix with everything implicit. ``impulse`` is left without external forces.
     """
     sync_threads(threads)
+    bend_joints(body, e, thread, threads, w)
     for k in range(thread, TRIPLES, threads):
         joint_impulse(
-            body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
+            body,
+            dt,
+            w.pose,
+            target,
+            springs,
+            tissue,
+            w.bend,
+            w.tissue,
+            w.velocity,
+            w.outside,
+            e,
+            k,
+            w.muscle,
+            w.impulse,
         )
         set_triple(w.impulse, e, 3 * k, triple_of(w.impulse, e, 3 * k) + push_of(w, e, k))
+    release_joints(e, BONES, thread, threads, w.stops)
     load_factor(w.factors, driven, arena)
     factor = int(driven)
     contact = vec8()
     cuts = int(0)
-    while factor >= 0:  # repeated while muscles reach their limits
+    while factor >= 0:  # repeated while muscles reach their limits, and joints the ends of their ranges
         solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, arena, w.shares)
         contact = stop_bones(body, ground, dt, own, factor, e, thread, threads, arena, w)
         if cuts == MOST_CUTS:
             break
-        if limit_joints(body, dt, springs, strength, driven, own, cuts > 0, e, thread, threads, w) == 0.0:
+        if limit_joints(body, dt, springs, tissue, strength, driven, own, cuts > 0, e, thread, threads, w) == 0.0:
             break
         cuts += 1
         factor = w.factors.shape[0] - 1
-        factorize(w.pattern, w.matrix, w.left, e, e, arena, factor, w.factors)
+        at = place_of_factor(w.factors, factor, arena)
+        load_arena(w.matrix, e, at)
+        add_blocks(w.pattern.entry, w.stops.inertia, e, 1, at)
+        factorize_in_arena(w.pattern, w.left, e, at)
+    finish_stops(w.shares, own, e, BONES, thread, threads, w.stops, w.impulse)
     final_impulses(w.left, w.push, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     support = triple_of(w.impulse, e, 0) + push_of(w, e, 0) + wp.vec3(contact[0], contact[1], contact[2])
@@ -246,6 +293,7 @@ def build_mass(
     body: Body,
     pairs: Pairs,
     dt: float,
+    target: Target,
     springs: Springs,
     tissue: Tissue,
     failure: wp.array(dtype=int),
@@ -264,8 +312,9 @@ def build_mass(
     if failure[e] != 0:
         return
     n = failure.shape[0]
+    bend_joints(body, e, thread, threads, w)
     for k in range(thread, TRIPLES, threads):
-        implicit_diagonal(body, dt, w.pose, springs, tissue, e, k, n + e, w.stop, w.diagonals)
+        implicit_diagonal(body, dt, target, springs, tissue, w.bend, e, k, n + e, w.tissue, w.diagonals)
     records = record_arena(w.records, 0)
     load_positions(w.pose.position, e, thread, threads, records, PLACES)
     position = view_vectors(w.pose.position, records, PLACES, 0)
@@ -360,6 +409,6 @@ def act(
         support.force[e] = support.force[e] + per_time * triple_of(w.impulse, e, 0)
         support.torque[e] = support.torque[e] + per_time * triple_of(w.impulse, e, 3)
     for move in range(moves):
-        advance_pose(body, dt, move, off, e, thread, threads, near)
+        advance_pose(body, dt, tissue, move, off, e, thread, threads, near)
     begin(body, e, thread, threads, near)
     store_workspace(w, e, near)

@@ -137,6 +137,21 @@ def add_diagonal(entry: wp.array(dtype=int), diagonal: wp.array2d(dtype=float), 
     ...
 
 
+@wp.func_native(
+    _ARENA
+    + """
+for (int i = lane; i < 9 * blocks.shape[1]; i += LANES) {
+    const int n = i / 9 + first, k = i % 9;
+    arena[entry.data[3 * n] + k] += wp::index(blocks, e, i / 9).data[k / 3][k % 3];
+}
+sync();
+"""
+)
+def add_blocks(entry: wp.array(dtype=int), blocks: wp.array2d(dtype=wp.mat33), e: int, first: int, at: wp.uint64):
+    """Add row ``e`` of ``blocks`` to the diagonal blocks of the matrix in an arena, from triple ``first`` on."""
+    ...
+
+
 @wp.func_native(f"""
 float* const to = reinterpret_cast<float*>(at) + 9 * block;
 if (block < 0) return;

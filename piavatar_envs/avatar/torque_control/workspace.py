@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.torque_control.joint_stops import Stops
 from piavatar_envs.avatar.torque_control.tree_cholesky import ARENA_WORDS, COLUMN, MOST_ROWS, SPARE, Pattern
 from piavatar_envs.avatar.types import Pose
 from piavatar_envs.core.arrays import vec8, vec12, vec16
@@ -31,7 +32,9 @@ class TorqueWorkspace:
     diagonals: wp.array2d(dtype=float)  # (2 num_envs, 69) added to the mass matrix before factorization
     # (2 num_envs + 1, entries); the last one, for muscles at their limits, is used on a CPU only
     factors: wp.array2d(dtype=float)
-    stop: wp.array2d(dtype=float)  # (num_envs, bones) stiffness beyond the range [N m/rad]
+    stops: Stops
+    bend: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) rotation vectors of the joints [rad]
+    tissue: wp.array2d(dtype=float)  # (num_envs, bones) stiffness of tissue in the factor [N m/rad]
     # sums over particles
     moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
     # (num_envs, chunks) momenta of the velocity after the pull, and of the displacements to the skinned places

@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field
 from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.skeleton import Bounds, joint_index
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.torque_control.joint_torques import beyond
+from piavatar_envs.avatar.torque_control.joint_tissue import beyond
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import FROZEN, ConfigError
 from piavatar_envs.core.structs import fill
