@@ -32,8 +32,10 @@ from agents.pid.balance import FRONTAL, GRAVITY, Balance, Effort, Stance
 from agents.pid.bones import NUM_DOF, Bones, Posture, answered, force_moments, in_bones
 from agents.pid.controller import PID, PosePID, difference, follow
 from agents.pid.gains import LoadSchedule, gains_by_strength
+from agents.pid.tissue import Tissue
 from piavatar_envs.avatar.body.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, make_muscles
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_ACTUATED, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.torque_control.joint_tissue import RETARDATION_TIME
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.tasks import load_task
@@ -158,8 +160,8 @@ class PIDAgent:
         size = self.bones.mass.sum() * np.ptp(points.rest[0][:, 2]) / (REFERENCE_MASS * REFERENCE_HEIGHT)
         muscles = make_muscles(strength=env.config.control.strength)
         self.lower, self.upper = size * muscles.lower, size * muscles.upper
-        # what tissue resists within a step, as an inertia: that of a hand is less
-        self._resisting = np.repeat(self.dt * muscles.tissue_damping[1:], 3)
+        self.tissue = Tissue(size, env.simulation.flesh[0].torque_control().flesh_stiffness)
+        self._tissue_damping = size * muscles.tissue_damping
         self.balance = self._balance()
         self.poses = poses
         self.begin(0)
@@ -201,15 +203,16 @@ class PIDAgent:
         local = _matrices(seen["joint_rotations"].reshape(n, NUM_ACTUATED, 6))
         rate = np.einsum("nbij,nbi->nbj", local, seen["joint_velocities"].reshape(n, NUM_ACTUATED, 3))
         moments = self.bones.weight_moments(now, GRAVITY) + self._ground_moments(seen, now)
-        matrix = self._answer(now)
         vectors = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(n, NUM_ACTUATED, 3)
+        bend = np.concatenate([np.zeros((n, 1, 3)), vectors], axis=1)
+        matrix, resisted = self._answer(now, bend), self.tissue.torque(bend)[:, 1:]
         target, target_rate = self._target(seen, vectors)
         torque = self.pid.step(
             vectors,
             target,
             rate,
             target_rate,
-            feedforward=-in_bones(now, moments)[:, 1:],
+            feedforward=-in_bones(now, moments)[:, 1:] - np.einsum("nbij,nbi->nbj", local, resisted),
             factor=self._stiff * self._schedule(self._leg_loads),
             ahead=lambda still, added: answered(matrix, still, added),
             given=lambda asked: self.given(local, asked),
@@ -253,10 +256,13 @@ class PIDAgent:
         self._clip = coming
         return now, difference(now, coming) / self.dt
 
-    def _answer(self, now: Posture) -> np.ndarray:
-        """Return the mass matrix, with the inertia that tissue adds to it."""
-        matrix, joints = self.bones.mass_matrix(now), np.arange(NUM_DOF - len(self._resisting), NUM_DOF)
-        matrix[:, joints, joints] += self._resisting
+    def _answer(self, now: Posture, bend: np.ndarray) -> np.ndarray:
+        """Return the mass matrix, with the inertia that tissue adds to it: what it resists within a step."""
+        matrix = self.bones.mass_matrix(now)
+        stiffness = self.tissue.pull(bend)[1].max(axis=-1)
+        resisting = self.dt * (self._tissue_damping + (RETARDATION_TIME + self.dt) * stiffness)
+        joints = np.arange(NUM_DOF - 3 * NUM_ACTUATED, NUM_DOF)
+        matrix[:, joints, joints] += np.repeat(resisting[:, 1:], 3, axis=1)
         return matrix
 
     def _ground_moments(self, seen: Mapping[str, np.ndarray], now: Posture) -> np.ndarray:
