@@ -179,6 +179,14 @@ def test_bone_particles(coarse):
     assert coarse.bone.min() == -1 and coarse.bone.max() == NUM_JOINTS - 1
 
 
+def test_feet_bear_on_their_heels(asset, coarse):
+    # The centre of mass lies 12 mm ahead of the ankles: without bone behind them, it is beyond what feet support.
+    for name in ("left_ankle", "right_ankle"):
+        joint = joint_index(name)
+        ahead = asset.joints[joint, 1] - coarse.rest_positions[coarse.bone == joint, 1]
+        assert ahead.min() < -0.012 and ahead.max() > 0.08
+
+
 def test_sampling_is_deterministic_and_seeded(asset):
     one, again, other = (sample_particles.__wrapped__(asset, 0.07, seed=seed) for seed in (0, 0, 1))
     for name in ("rest_positions", "volumes", "skin_joints", "skin_weights", "bone", "links"):

@@ -466,15 +466,24 @@ def _bone_ends(asset: AvatarAsset, skin: ClosedSurface) -> np.ndarray:
     return ends
 
 
+def _bone_starts(asset: AvatarAsset, ends: np.ndarray) -> np.ndarray:
+    """Return the near end of every bone [m], shape ``(22, 3)``: its joint, but the heel for feet, which bear on it."""
+    starts = asset.joints.astype(np.float64)
+    for joint in (joint_index("left_ankle"), joint_index("right_ankle")):
+        own = asset.vertices[asset.skin_joints[:, 0] == joint]
+        starts[joint, 1:] = own[:, 1].max(initial=starts[joint, 1]), ends[joint, 2]
+    return starts
+
+
 def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Return bone particles ``(B, 3)`` and the joint each belongs to ``(B,)``: rings around every bone's axis."""
     ends = _bone_ends(asset, skin)
+    starts = _bone_starts(asset, ends)
     points = np.empty((NUM_JOINTS, rings * (BONE_RING + 1), 3))
     angles = 2.0 * np.pi * np.arange(BONE_RING) / BONE_RING
     for joint, name in enumerate(JOINT_NAMES):
-        start = asset.joints[joint].astype(np.float64)
-        axis = ends[joint] - start
-        centres = start + np.linspace(*BONE_RANGE, rings)[:, None] * axis
+        axis = ends[joint] - starts[joint]
+        centres = starts[joint] + np.linspace(*BONE_RANGE, rings)[:, None] * axis
         depth = -skin.distance(centres)
         if depth.max() <= 0.0:
             raise ValueError(f"the bone of {name} lies outside the skin by {-depth.max():.3f} m; move its joint inside")
