@@ -28,7 +28,7 @@ from piavatar_envs.tasks.common.upright import (
     StillConfig,
     Upright,
     UprightConfig,
-    mean_angle,
+    pose_error,
     posture_of,
     record_observe_upright,
     restfulness,
@@ -194,7 +194,7 @@ def judge_rising(
     e = wp.tid()
     now = posture_of(rule, bones, e)
     speed = wp.length(bones.velocity[e, 0])
-    angle = mean_angle(bones, e)
+    angle = pose_error(bones, e)
     stands = now.high * now.straight
     high = wp.sqrt(wp.clamp(now.head, 0.0, 1.0) * wp.clamp(now.pelvis, 0.0, 1.0))
     outcome.terms[e, 0, GetUpTask.rewards.height] = 0.5 * high
@@ -253,8 +253,9 @@ class GetUpTask(Task):
         ),
         Term(
             "pose",
-            "0.15 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that "
-            "has fallen to 0.015 after another `still.pose_margin`; all as `still`",
+            "0.15 while the mean angle from the rest pose is at most 0.05 rad, of all joints and of the trunk's three; "
+            "beyond it, by the greater one, a Gaussian that has fallen to 0.015 after another `still.pose_margin`; all "
+            "as `still`",
         ),
         CONTROL,
     )

@@ -15,6 +15,7 @@ from tests.tasks.measured import joints, pelvis, seen, still, tolerance
 STAND, PUSH, WALK = "PIAvatar/Stand-v0", "PIAvatar/PushRecovery-v0", "PIAvatar/Walk-v0"
 GET_UP = "PIAvatar/GetUp-v0"
 HEAD, CHEST = joint_index("head"), joint_index("spine3")
+TRUNK = [joint_index(name) for name in ("spine1", "spine2", "spine3")]
 
 
 def shares(env) -> tuple[float, float, float]:
@@ -46,7 +47,7 @@ def test_the_ground_bears_the_body_and_feet_neither_sink_nor_hover(make_env):
         assert not terminated and info["success"]
     sim = env.batch.simulation
     lowest = sim.state.x.numpy()[0, :, 2].min()
-    assert abs(lowest - sim.flesh[0].points.rest[0, :, 2].min()) < 0.005
+    assert abs(lowest - sim.flesh[0].points.rest[0, :, 2].min()) < 0.01  # heels give way by millimetres
     ground = sim.sensors.boundary_impulse.numpy()[0, 0, 2] / env.config.physics.control_dt
     weight = 9.81 * sim.flesh[0].points.mass.sum()
     assert ground + info["root_force"][2] == pytest.approx(weight, rel=0.01) and ground > 0.5 * weight
@@ -67,7 +68,7 @@ def test_feet_share_the_load(make_env):
         action = still(env)
         for name in ("spine1.y", "spine2.y", "spine3.y"):
             action[env.action_names.index(name)] = bend
-        for _ in range(40):
+        for _ in range(60):  # until it has ceased to sway
             observation = env.step(action)[0]
         loads[bend] = seen(env, observation, "foot_impulses")
         ground = sim.sensors.boundary_impulse.numpy()[0, 0, 2]
@@ -83,7 +84,7 @@ def test_feet_share_the_load(make_env):
     leaning = {bend: (load[0] - load[1]) / load.sum() for bend, load in loads.items()}
     assert expected[1.0] > 0.05 and leaning[-1.0] == pytest.approx(-leaning[1.0], rel=0.2)
     for bend in (1.0, -1.0):
-        assert leaning[bend] == pytest.approx(expected[bend], rel=0.2)
+        assert leaning[bend] == pytest.approx(expected[bend], rel=0.1)
 
 
 #: Settings of the posture that differ from the defaults.
@@ -107,7 +108,8 @@ def test_reward_metrics_and_falls_are_what_the_joints_say(make_env, task, settin
         assert info["tilt_deg"] == pytest.approx(np.degrees(tilt), abs=0.05)
         tracked = env.batch.simulation.avatar.tracked
         speed = float(np.linalg.norm(tracked.velocity.numpy()[0, 0]))
-        angle = Rotation.from_quat(tracked.local.numpy()[0, 1:].astype(float)).magnitude().mean()
+        angles = Rotation.from_quat(tracked.local.numpy()[0].astype(float)).magnitude()
+        angle = max(angles[1:].mean(), angles[TRUNK].mean())
         assert terms["height"] == pytest.approx(0.3 * high, abs=1e-4)
         assert terms["upright"] == pytest.approx(0.3 * tolerance(tilt, 0.1, rule.tilt_margin), abs=1e-3)
         assert terms["still"] == pytest.approx(0.2 * high * tolerance(speed, 0.05, rest.speed_margin), abs=2e-4)

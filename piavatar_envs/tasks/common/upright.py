@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 _CHEST = wp.constant(joint_index("spine3"))
+_TRUNK = wp.constant(wp.vec3i(*(joint_index(name) for name in ("spine1", "spine2", "spine3"))))
 _LEFT, _RIGHT = wp.constant(joint_index("left_ankle")), wp.constant(joint_index("right_ankle"))
 
 UPRIGHT_TERMS = (
@@ -59,8 +60,9 @@ STANDING_REWARDS = (
     ),
     Term(
         "pose",
-        "0.2 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that has "
-        "fallen to 0.02 after another `still.pose_margin`; all times `height` / 0.3",
+        "0.2 while the mean angle from the rest pose is at most 0.05 rad, of all joints and of the trunk's three; "
+        "beyond it, by the greater one, a Gaussian that has fallen to 0.02 after another `still.pose_margin`; all "
+        "times `height` / 0.3",
     ),
     CONTROL,
 )
@@ -145,12 +147,18 @@ def posture_of(rule: Upright, bones: Bones, e: int):
 
 
 @wp.func
-def mean_angle(bones: Bones, e: int):
-    """Return the mean angle of all joints but the pelvis from the rest pose [rad]."""
+def pose_error(bones: Bones, e: int):
+    """Return the mean angle from the rest pose of all joints but the pelvis, or of the trunk's three if greater [rad].
+
+    Among 21 joints, a trunk that hangs in its ligaments would hardly count.
+    """
     total = float(0.0)
     for b in range(1, bones.local.shape[1]):
         total += wp.length(quat_log(bones.local[e, b]))
-    return total / float(bones.local.shape[1] - 1)
+    trunk = float(0.0)
+    for k in range(3):
+        trunk += wp.length(quat_log(bones.local[e, _TRUNK[k]]))
+    return wp.max(total / float(bones.local.shape[1] - 1), trunk / float(3))
 
 
 @wp.func
@@ -169,7 +177,7 @@ def stillness(still: Still, speed: float):
 
 @wp.func
 def restfulness(still: Still, angle: float):
-    """Return 1 while the mean angle of the joints from the rest pose [rad] is small, less the greater it is."""
+    """Return 1 while :func:`pose_error` [rad] is small, less the greater it is."""
     return tolerance(angle, 0.05, still.pose_margin)
 
 
@@ -194,7 +202,7 @@ def judge_standing(
     e = wp.tid()
     now = posture_of(rule, bones, e)
     speed = wp.length(bones.velocity[e, 0])
-    angle = mean_angle(bones, e)
+    angle = pose_error(bones, e)
     outcome.terms[e, 0, StandingTask.rewards.height] = 0.3 * now.high
     outcome.terms[e, 0, StandingTask.rewards.upright] = 0.3 * now.straight
     outcome.terms[e, 0, StandingTask.rewards.still] = 0.2 * now.high * stillness(still, speed)
