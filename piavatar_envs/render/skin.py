@@ -12,15 +12,12 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from piavatar_envs.avatar.body.interpolation import interpolation_matrix
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 
 #: Particles that move a vertex. With few, what neighbours differ by crumples the skin where it is finer than they are:
 #: toes on the ground, between bones that are put into their places and flesh that is not.
 NUM_NEIGHBOURS = 24
-#: Particles looked at for each vertex, in turn: more only where too few of the nearest share the vertex's bones.
-_CANDIDATES = (64, 256)
-#: A particle with less than this share of the best candidate's overlap moves with other bones: leave it out.
-_MIN_RELATIVE_OVERLAP = 0.05
 #: Particles that move a vertex of a prop.
 _PROP_NEIGHBOURS = 6
 
@@ -73,11 +70,12 @@ class Skin:
         self._rest_joints = np.asarray(body.joints, dtype=np.float64)
         self._vertex_skinning = _skinning_matrix(vertices, asset.skin_joints, asset.skin_weights)
         self._particle_skinning = _skinning_matrix(particles, skin_joints, skin_weights)
-        self._interpolation = _interpolation_matrix(
+        self._interpolation = interpolation_matrix(
             vertices,
             _joint_weights(asset.skin_joints, asset.skin_weights),
             particles,
             _joint_weights(skin_joints, skin_weights),
+            NUM_NEIGHBOURS,
         )
 
     @property
@@ -140,56 +138,6 @@ def _joint_weights(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
     dense = np.zeros((len(joints), NUM_JOINTS))
     np.add.at(dense, (np.arange(len(joints))[:, None], np.asarray(joints, dtype=np.int64)), weights)
     return dense
-
-
-def _interpolation_matrix(
-    vertices: np.ndarray, vertex_weights: np.ndarray, particles: np.ndarray, particle_weights: np.ndarray
-) -> sparse.csr_array:
-    """Weigh the nearest particles that move with each vertex's own bones, ``(V, P)``, rows sum to one.
-
-    The nearest particle to the inside of one thigh may lie in the other: distance alone would glue them together.
-    ``overlap = sum_b w_vertex,b w_particle,b`` is zero between them.
-    """
-    num_neighbours = min(NUM_NEIGHBOURS, len(particles))
-    tree = cKDTree(particles)
-    neighbours = np.zeros((len(vertices), num_neighbours), dtype=np.int64)
-    weights = np.zeros((len(vertices), num_neighbours))
-    todo = np.arange(len(vertices))
-    for count in (*_CANDIDATES, len(particles)):
-        last = count >= len(particles)
-        distance, index = tree.query(vertices[todo], k=np.arange(1, min(count, len(particles)) + 1))
-        overlap = np.einsum("vb,vcb->vc", vertex_weights[todo], particle_weights[index])
-        compatible = overlap > _MIN_RELATIVE_OVERLAP * np.maximum(overlap.max(axis=1, keepdims=True), 0.2)
-        # One more than needed: the kernel falls to zero at the first particle left out, so that weights are smooth.
-        done = (compatible.sum(axis=1) > num_neighbours) | last
-        rows = todo[done]
-        if len(rows):
-            neighbours[rows], weights[rows] = _select(
-                distance[done], index[done], overlap[done], compatible[done], num_neighbours
-            )
-        todo = todo[~done]
-        if last or not len(todo):
-            break
-    rows = np.broadcast_to(np.arange(len(vertices))[:, None], neighbours.shape)
-    return sparse.csr_array(
-        (weights.ravel(), (rows.ravel(), neighbours.ravel())), shape=(len(vertices), len(particles))
-    )
-
-
-def _select(
-    distance: np.ndarray, index: np.ndarray, overlap: np.ndarray, compatible: np.ndarray, num_neighbours: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return nearest compatible candidates of each row and their weights, both ``(rows, num_neighbours)``."""
-    # A vertex that shares no bone with any candidate takes the nearest particles.
-    compatible = np.where(compatible.any(axis=1, keepdims=True), compatible, True)
-    overlap = np.where(compatible, np.maximum(overlap, 1e-6), 0.0)
-    order = np.argsort(np.where(compatible, distance, np.inf), axis=1, kind="stable")[:, : num_neighbours + 1]
-    distance, index, overlap = (np.take_along_axis(array, order, axis=1) for array in (distance, index, overlap))
-    valid = overlap > 0.0
-    support = np.max(np.where(valid, distance, 0.0), axis=1, keepdims=True) * (1.0 + 1e-6) + 1e-12
-    weights = overlap * (1.0 - np.minimum(distance / support, 1.0) ** 2) ** 2
-    weights, index = weights[:, :num_neighbours], index[:, :num_neighbours]
-    return index, weights / weights.sum(axis=1, keepdims=True)
 
 
 class SolidSurface:
