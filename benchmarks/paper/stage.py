@@ -219,10 +219,13 @@ class Course:
         """Return the distance of ``chosen`` flesh from its skinned place on the tracked bones [m], ``(T, n)``."""
         points = self.stage.simulation.flesh[0].points
         found = []
-        for x, turn, at in zip(self.x, self.bones, self.joints, strict=True):
+        for x, local, turn, at in zip(self.x, self.local, self.bones, self.joints, strict=True):
             turned = Rotation.from_quat(turn.astype(float)).as_matrix()
             joints, weights = points.skin_joints[chosen], points.skin_weights[chosen]
-            place = skin(points.rest[0][chosen], joints, weights, turned, at.astype(float), points.joints[0])
+            rest = points.rest[0]
+            if points.correctives is not None:
+                rest = rest + points.correctives.displacement(local)
+            place = skin(rest[chosen], joints, weights, turned, at.astype(float), points.joints[0])
             found.append(np.linalg.norm(x[: len(chosen)][chosen] - place, axis=1))
         return np.array(found)
 

@@ -17,6 +17,7 @@ from piavatar_envs.avatar.body.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index, skin
 from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.sim.world import Simulation
 
 #: Empty space: settings of a scene in which nothing weighs anything.
 EMPTY: dict[str, Any] = {"gravity": 0.0, "scene": {"ground": False}}
@@ -158,7 +159,7 @@ class Measurements:
         points, (rotation, position) = self.points, self.pose
         weights = points.skin_weights.astype(float)
         weights /= weights.sum(1, keepdims=True)
-        rest, joints = points.rest[0].astype(float), points.joints[0].astype(float)
+        rest, joints = corrected_rest(self.simulation), points.joints[0].astype(float)
         return skin(rest, points.skin_joints, weights, rotation, position, joints)
 
     def displacement(self) -> np.ndarray:
@@ -251,6 +252,15 @@ class Probe(Measurements):
         """Take control steps for some time."""
         for _ in range(round(seconds / self.dt)):
             self.step()
+
+
+def corrected_rest(simulation: Simulation) -> np.ndarray:
+    """Return the rest positions that the particles of the first avatar are skinned from now [m], shape ``(P, 3)``."""
+    points, avatar = simulation.flesh[0].points, simulation.avatars[0]
+    rest = points.rest[0].astype(float)
+    if points.correctives is not None:
+        rest += points.correctives.displacement(avatar.state.corrected_rotation.numpy()[0])
+    return rest
 
 
 def _fraction(tree: cKDTree, x: np.ndarray, volume: np.ndarray, places: np.ndarray, h: float) -> np.ndarray:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from agents.pid.agent import PIDAgent
 from benchmarks.physics.blows import HOLDS
 from benchmarks.physics.limbs import Options, widest
+from benchmarks.physics.probe import corrected_rest
 from benchmarks.physics.rig import joint_gaps
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index, skin
 from piavatar_envs.config import load_config
@@ -41,7 +42,7 @@ def homes(env: BatchEnv) -> np.ndarray:
     simulation = env.simulation
     pose, points = simulation.controllers[0].state, simulation.flesh[0].points
     world = Rotation.from_quat(pose.rotation.numpy()[0].astype(float)).as_matrix()
-    rest, weights = points.rest[0].astype(float), points.skin_weights.astype(float)
+    rest, weights = corrected_rest(simulation), points.skin_weights.astype(float)
     position, joints = pose.position.numpy()[0].astype(float), points.joints[0].astype(float)
     return skin(rest, points.skin_joints, weights / weights.sum(1, keepdims=True), world, position, joints)
 

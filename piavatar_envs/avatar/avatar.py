@@ -13,6 +13,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body.device import BodyPoints, build_body
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.correctives import begin_corrections, place_corrections
 from piavatar_envs.avatar.kinematics import pose_body, rest_matrices
 from piavatar_envs.avatar.skinning import skinned_place
 from piavatar_envs.avatar.tracking import local_rotations, track_bones
@@ -51,15 +52,17 @@ class Avatar:
         """
         n, device = model.num_envs, model.device
         self.model, self.num_points, self.threads = model, points.num_points, warp_threads(device)
-        self.body = build_body(points, first, device)
+        self.body = build_body(points, first, device, n)
         self.body_mass = wp.array(points.mass.sum(1).astype(np.float32), dtype=float, device=device)
         self.state: AvatarState = allocate(AvatarState, n, device)
         self.tracked: Tracked = allocate(Tracked, n, device)
         self.placed = allocate(Pose, n, device)
-        for rotation in (self.state.command_rotation, self.state.goal_rotation, self.tracked.rotation):
+        commands = self.state.command_rotation, self.state.goal_rotation, self.state.corrected_rotation
+        for rotation in (*commands, self.tracked.rotation):
             rotation.fill_(wp.quat_identity())
         self._bone_from = wp.zeros((n, NUM_JOINTS), dtype=wp.mat44, device=device)
         self._still = wp.zeros((n, NUM_JOINTS), dtype=wp.vec3, device=device)
+        self._before = wp.zeros((n, NUM_JOINTS), dtype=wp.quat, device=device)
 
     def record_pose(
         self,
@@ -92,8 +95,10 @@ class Avatar:
             reset_commands,
             (n, NUM_JOINTS),
             [mask, s.command_rotation, s.command_root],
-            [s.goal_rotation, s.goal_root, s.released, s.wrench_force, s.wrench_torque],
+            [s.goal_rotation, s.goal_root, s.released, s.wrench_force, s.wrench_torque, s.corrected_rotation],
         )
+        if self._corrections.size > 0:
+            graph.launch(place_corrections, self._corrections.shape, [mask, s.corrected_rotation], [self.body])
         self.record_still_pose(graph, (s.command_rotation, s.command_root), self.placed)
         graph.launch(
             rest_matrices, (n, NUM_JOINTS), [self.body, self.placed.rotation, self.placed.position], [self._bone_from]
@@ -111,6 +116,25 @@ class Avatar:
         graph.launch(rest_matrices, (n, NUM_JOINTS), [self.body, after.rotation, after.position], [matrices])
         inputs = [mask, self.body, self.model.control_dt, matrices, state.x]
         graph.launch(set_in_motion, (n, self.num_points), inputs, [state.u])
+
+    def record_corrections(self, graph: LaunchGraph, aim: wp.Kernel, inputs: list) -> None:
+        """Append the correctives of a control step, for the local rotations at its end.
+
+        Args:
+            graph: the launch graph to append to.
+            aim: kernel over ``(num_envs, bones)`` that moves the corrected rotations on to these.
+            inputs: of that kernel.
+        """
+        if self._corrections.size == 0:
+            return
+        corrected = self.state.corrected_rotation
+        graph.launch(aim, corrected.shape, inputs, [corrected, self._before])
+        graph.launch(begin_corrections, self._corrections.shape, [self._before, corrected], [self.body])
+
+    @property
+    def _corrections(self) -> wp.array:
+        """Return the displacements of the rest pose, ``(num_envs, particles)``; empty where there are none."""
+        return self.body.correctives.displacement
 
     def record_clear_support(self, graph: LaunchGraph) -> None:
         """Append the clearing of the mean force and torque on the root, at the start of a control step."""
@@ -141,12 +165,14 @@ def reset_commands(
     released: wp.array(dtype=int),
     wrench_force: wp.array(dtype=wp.vec3),
     wrench_torque: wp.array(dtype=wp.vec3),
+    corrected_rotation: wp.array2d(dtype=wp.quat),
 ):
     """Make the commanded pose the goal of the masked environments, and hold their roots again."""
     e, b = wp.tid()
     if not mask[e]:
         return
     goal_rotation[e, b] = command_rotation[e, b]
+    corrected_rotation[e, b] = command_rotation[e, b]
     if b == 0:
         goal_root[e] = command_root[e]
         released[e] = 0
@@ -174,7 +200,7 @@ def place_particles(
     if not mask[e]:
         return
     q = body.first + p
-    x[e, q] = skinned_place(body, bone_from, e, p)
+    x[e, q] = skinned_place(body, bone_from, 1.0, e, p)
     u[e, q] = wp.vec3(0.0)
     kinematic.vk[e, q] = wp.vec3(0.0)
     kinematic.spin[e, q] = wp.vec3(0.0)
@@ -198,7 +224,7 @@ def set_in_motion(
     if not mask[e]:
         return
     q = body.first + p
-    u[e, q] = (skinned_place(body, bone_after, e, p) - x[e, q]) / time
+    u[e, q] = (skinned_place(body, bone_after, 1.0, e, p) - x[e, q]) / time
 
 
 @wp.kernel

@@ -14,9 +14,9 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.correctives import corrected_rest
 from piavatar_envs.avatar.types import Body, vec24, vec44
-from piavatar_envs.core.arrays import vec8, vec12, vector_at
-from piavatar_envs.mpm.types import row
+from piavatar_envs.core.arrays import vec8, vec12
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,18 +90,21 @@ AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
     + """
 wp::vec_t<24, wp::float32> sum;
 const auto add = [&](const wp::float32* bone, wp::float32 w) {
-    wp::float32 at[3];
+    wp::float32 end[3], rates[3];  // where the bone would be without its turn, and velocity in the bone
 #pragma unroll
     for (int i = 0; i < 6; ++i) {  // place and lean
         const wp::float32* const row = bone + 4 * i;
         const wp::float32 value = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
-        if (i < 3) at[i] = value;
+        if (i < 3) {
+            rates[i] = row[0] * rate[0] + row[1] * rate[1] + row[2] * rate[2];
+            end[i] = value + dt * rates[i];
+        }
         sum[i] += w * value;
     }
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
         const wp::float32* const turn = bone + 24 + 3 * i;
-        sum[6 + i] += w * (turn[0] * at[0] + turn[1] * at[1] + turn[2] * at[2] + bone[33 + i]);
+        sum[6 + i] += w * (turn[0] * end[0] + turn[1] * end[1] + turn[2] * end[2] + bone[33 + i] + rates[i]);
     }
 #pragma unroll
     for (int i = 0; i < 9; ++i) sum[9 + i] += w * bone[24 + i];
@@ -136,8 +139,13 @@ def blend_records(
     skin: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
+    rate: wp.vec3,
+    dt: float,
 ) -> vec24:
-    """Return the blend of the records of particle ``p``'s bones, with places and velocities evaluated at ``rest``."""
+    """Return the blend of the records of particle ``p``'s bones, with places and velocities evaluated at ``rest``.
+
+    ``rest`` changes at ``rate`` [m/s]; the velocity is the chord between the places at both ends of the substep ``dt``.
+    """
     ...
 
 
@@ -269,12 +277,13 @@ for (int n = 0; n < 4; ++n) {
     if (w <= 0.0f) continue;
     const auto& bone = place.data[place.shape[1] * e + joint(n)];
     const auto& own = motion.data[motion.shape[1] * e + joint(n)];
-    wp::float32 image[3];
+    wp::float32 image[3], inside[3];
 #if defined(__CUDA_ARCH__)
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
         const float4 row = reinterpret_cast<const float4*>(&bone)[i];
         image[i] = row.x * rest[0] + row.y * rest[1] + row.z * rest[2] + row.w;
+        inside[i] = row.x * rate[0] + row.y * rate[1] + row.z * rate[2];
     }
     const float4* const from = reinterpret_cast<const float4*>(&own);
     const float4 a = from[0], b = from[1];
@@ -283,6 +292,7 @@ for (int n = 0; n < 4; ++n) {
     for (int i = 0; i < 3; ++i) {
         const auto& row = bone.data[i];
         image[i] = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
+        inside[i] = row[0] * rate[0] + row[1] * rate[1] + row[2] * rate[2];
     }
     const wp::float32 v[3] = {own[0], own[1], own[2]}, s[3] = {own[3], own[4], own[5]};
 #endif
@@ -292,7 +302,7 @@ for (int n = 0; n < 4; ++n) {
         sum[i] += w * v[i];
         sum[3 + i] += w * s[i];
         sum[6 + i] += w * image[i];
-        sum[9 + i] += w * (s[j] * image[k] - s[k] * image[j]);
+        sum[9 + i] += w * (s[j] * image[k] - s[k] * image[j] + inside[i]);
     }
 }
 return sum;
@@ -305,19 +315,23 @@ def blend_images(
     skin: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
+    rate: wp.vec3,
 ) -> vec12:
-    """Return the blend of the bones' motions, their images of the particle, and the velocity of these by their spins.
+    """Return the blend of the bones' motions, their images of the particle, and the velocity of these.
 
-    Each bone's spin turns its own image of the particle about the origin of the places.
+    Each bone's spin turns its own image of the particle about the origin of the places, and ``rate`` is the velocity of
+    ``rest`` [m/s].
     """
     ...
 
 
 @wp.func
-def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
-    """Return the skinned position of a particle [m]; ``place`` takes bones from rest to the world."""
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    return blend_places(place, e, body.skin, p, rest)
+def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), elapsed: float, e: int, p: int):
+    """Return the skinned position of a particle when a share ``elapsed`` of the control step is over [m].
+
+    ``place`` takes bones from rest to the world.
+    """
+    return blend_places(place, e, body.skin, p, corrected_rest(body, elapsed, e, p))
 
 
 @wp.func

@@ -37,14 +37,31 @@ vec24 = wp.types.vector(length=24, dtype=wp.float32)
 
 
 @wp.struct
+class Correctives:
+    """Displacements of the rest pose that depend on the pose, see :mod:`piavatar_envs.avatar.correctives`.
+
+    Of the particles from ``Body.alone`` on, which several bones move; arrays without entries where there are none. The
+    entries of such a particle ``p`` are ``[start[p] : start[p + 1]]``.
+    """
+
+    start: wp.array(dtype=int)
+    joint: wp.array(dtype=int)  # of an entry
+    linear: wp.array(dtype=wp.mat33)  # [m]
+    quadratic: wp.array(dtype=wp.mat33)  # [m]
+    displacement: wp.array2d(dtype=wp.vec3)  # (num_envs, particles) at the beginning of a control step [m]
+    change: wp.array2d(dtype=wp.vec3)  # (num_envs, particles) in the control step [m]
+
+
+@wp.struct
 class Body:
-    """Constants of one avatar. ``(rows, ...)`` arrays have 1 or ``num_envs`` rows."""
+    """Constants of one avatar, and the displacements of its rest pose. ``(rows, ...)`` arrays have 1 or E rows."""
 
     first: int
     count: int
     rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
     skin: wp.array(dtype=wp.vec4)  # (count,) bones that move a particle, see piavatar_envs.avatar.skinning
     alone: int  # number of particles that a single bone moves; they come first
+    correctives: Correctives
     velocity_lag: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
@@ -211,6 +228,8 @@ class AvatarState:
     released: wp.array(dtype=int)  # (num_envs,) 1 once the root is no longer held
     wrench_force: wp.array(dtype=wp.vec3)  # (num_envs,) mean force on the root in the last control step [N]
     wrench_torque: wp.array(dtype=wp.vec3)  # (num_envs,) mean torque on it [N m]
+    # (num_envs, bones) local rotations that the correctives of the rest pose suit at the end of the control step
+    corrected_rotation: wp.array2d(dtype=wp.quat)
 
 
 @dataclass

@@ -18,6 +18,7 @@ from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
 from piavatar_envs.avatar.body.flesh_stiffness import flesh_stiffness
 from piavatar_envs.avatar.body.muscles import make_muscles
+from piavatar_envs.avatar.body.pose_correctives import COARSEST, pose_correctives
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
@@ -87,6 +88,7 @@ class Flesh:
         for region in avatar.regions:
             self.in_region(region)
         self.part = body_part_of_joint()[sampled.skin_joints[:, 0]].astype(np.int32)
+        self._correctives = pose_correctives(asset, sampled) if self.keeps_volume else None
         self._points, self._volume = self.shaped(self.base_parameters)
         if self.shape.randomize:
             self._points, self._volume = _repeat(self._points, num_envs), np.repeat(self._volume, num_envs, 0)
@@ -97,6 +99,12 @@ class Flesh:
     def settings(self) -> tuple:
         """Settings that determine a pool of bodies: avatars for which they are equal share one."""
         return self.asset, self.physics, self.shape, self.control.soft_tissue, self.avatar.regions
+
+    @property
+    def keeps_volume(self) -> bool:
+        """Return whether the rest pose is corrected: not in the paper's schemes, nor for particles too coarse."""
+        fine = self.sampled.spacing < COARSEST * float(np.ptp(self.asset.vertices[:, 2]))
+        return fine and self.physics.decoupling not in ("paper", "none")
 
     @property
     def drawn_on_host(self) -> bool:
@@ -149,6 +157,7 @@ class Flesh:
             skin_weights=sampled.skin_weights,
             bone=sampled.bone,
             velocity_lag=velocity_lag(self.control.soft_tissue, self._softness(rest))[None],
+            correctives=self._correctives,
         )
         return points, volume[None]
 
@@ -336,4 +345,5 @@ def shape_parameters(asset: AvatarAsset, shape: ShapeConfig) -> np.ndarray:
 def _repeat(points: BodyPoints, rows: int) -> BodyPoints:
     """Return the same points with a writable row for each environment."""
     repeated = {name: np.repeat(getattr(points, name), rows, 0) for name in _OF_POINTS}
-    return BodyPoints(**repeated, skin_joints=points.skin_joints, skin_weights=points.skin_weights, bone=points.bone)
+    shared = {name: getattr(points, name) for name in ("skin_joints", "skin_weights", "bone", "correctives")}
+    return BodyPoints(**repeated, **shared)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.device import BodyPoints
+from piavatar_envs.avatar.body.pose_correctives import pose_correctives
 from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
 from piavatar_envs.avatar.body.sources import load_asset
@@ -140,7 +141,10 @@ class Rig:
         p, row = self.points, min(env, len(self.points.rest) - 1)
         joints = p.joints[min(env, len(p.joints) - 1)].astype(float)
         world, positions = forward_kinematics(rotations, root, joints)
-        return skin(p.rest[row].astype(float), p.skin_joints, p.skin_weights.astype(float), world, positions, joints)
+        rest = p.rest[row].astype(float)
+        if p.correctives is not None:
+            rest = rest + p.correctives.displacement(Rotation.from_matrix(rotations).as_quat())
+        return skin(rest, p.skin_joints, p.skin_weights.astype(float), world, positions, joints)
 
     def target(self, env: int = 0) -> np.ndarray:
         """Return particles of the commanded pose."""
@@ -247,13 +251,14 @@ def build_rig(
     half_width: float = 1.3,
     others: int = 0,
     colliders: Sequence[Collider] = (),
+    keeps_volume: bool = False,
     **settings,
 ) -> Rig:
     """Build a standing avatar ``cells`` grid spacings tall.
 
     ``shapes`` are shape parameters by name, one set an environment; ``half_width`` is that of the domain [m];
     ``others`` is the number of particles before the avatar's, in a row in the domain's corner. ``colliders`` follow
-    the ``floor``.
+    the ``floor``. ``keeps_volume`` corrects the rest pose.
     """
     asset = load_asset()
     dx = float(np.ptp(asset.vertices[:, 2])) / cells
@@ -283,7 +288,9 @@ def build_rig(
     state.x.assign(x)
     velocity_lag = np.zeros((1, volume.shape[1]), np.float32)
     mass = volume * np.float32(DENSITY)
-    points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, velocity_lag)
+    correctives = pose_correctives(asset, particles) if keeps_volume else None
+    skinning = particles.skin_joints, particles.skin_weights
+    points = BodyPoints(rest, mass, joints, *skinning, particles.bone, velocity_lag, correctives)
     avatar = Avatar(points, others, model)
     controller = PoseController(avatar, pose_control(PoseControlConfig(**{"free_motion": False} | settings), model))
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)

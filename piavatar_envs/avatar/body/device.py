@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.body.pose_correctives import PoseCorrectives
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.correctives import upload_correctives
 from piavatar_envs.avatar.segment_sums import PARTITION_SIZE, Partitions, share_chunks
 from piavatar_envs.avatar.skinning import in_order, pack
 from piavatar_envs.avatar.types import Body
@@ -33,6 +35,7 @@ class BodyPoints:
         skin_weights: their weights, descending, rows sum to one, shape ``(num_points, 4)``.
         bone: joint that a point tracks, -1 for flesh, shape ``(num_points,)``.
         velocity_lag: share of a change of commanded motion that a point misses, shape ``(rows, num_points)``.
+        correctives: displacements of the rest pose that depend on the pose; none if not given.
     """
 
     rest: np.ndarray
@@ -42,6 +45,7 @@ class BodyPoints:
     skin_weights: np.ndarray
     bone: np.ndarray
     velocity_lag: np.ndarray
+    correctives: PoseCorrectives | None = None
 
     @property
     def num_points(self) -> int:
@@ -96,8 +100,8 @@ def bone_masses(points: BodyPoints) -> tuple[np.ndarray, np.ndarray]:
     return mass, center / np.maximum(mass, 1e-12)[..., None]
 
 
-def build_body(points: BodyPoints, first: int, device: str) -> Body:
-    """Upload a body whose particles start at ``first``.
+def build_body(points: BodyPoints, first: int, device: str, num_envs: int = 1) -> Body:
+    """Upload a body whose particles start at ``first``, in ``num_envs`` environments.
 
     Raises:
         ValueError: a bone has too few tracking particles, or weights do not sum to one.
@@ -124,6 +128,7 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.skin = upload(pack(joints, weights), wp.vec4)
     several = weights[:, 1] > 0.0
     body.alone = int(several.argmax()) if several.any() else points.num_points
+    body.correctives = upload_correctives(points.correctives, body.alone, num_envs, device)
     body.velocity_lag = upload(points.velocity_lag, float)
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)

@@ -11,6 +11,7 @@ import warp as wp
 
 from piavatar_envs.avatar.avatar import Avatar, reset_vectors
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.correctives import turn_joints
 from piavatar_envs.avatar.pose_control.bones import begin_control, end_control
 from piavatar_envs.avatar.pose_control.injection import bone_matrices, inject_velocity
 from piavatar_envs.avatar.pose_control.kernels import (
@@ -104,6 +105,9 @@ class PoseController:
             [w.increment, w.command.increment, w.root_increment, w.carry.rotation, w.carry.translation],
         )
         avatar.record_pose(graph, 0.0, self._start, (w.increment, w.root_increment), w.now)
+        if not self._injects:
+            inputs = [self._start[0], w.increment]
+            avatar.record_corrections(graph, turn_joints, inputs)
 
     def record_before_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
         """Append the stages before MPM substep ``step``: velocities of the particles, in the scheme of the model."""
@@ -136,7 +140,7 @@ class PoseController:
         inputs = [body, parameters, avatar.body_mass, step, self._chunk_threads, failure]
         graph.launch(prepare_body, (n, block), inputs, [w, root], block_dim=block)
 
-        inputs = [body, parameters, state.x, w.record, w.bones, released, failure]
+        inputs = [body, parameters, state.x, w.record, w.bones, released, step / model.num_substeps, failure]
         outputs = [state.u, self.motion, state.kinematic, w.pull, w.lean]
         graph.launch(command_particles, points, inputs, outputs, block_dim=BLOCK)
         if parameters.free_motion or parameters.root_rate > 0.0:  # a released root leaves an unsupported body

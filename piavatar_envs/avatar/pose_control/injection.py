@@ -54,8 +54,8 @@ def inject_velocity(
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    displacement = x[e, body.first + p] - skinned_place(body, bone_from, e, p)
-    k = skinned_place(body, bone_step, e, p) - kinematic_shape_rate * displacement
+    displacement = x[e, body.first + p] - skinned_place(body, bone_from, 0.0, e, p)
+    k = skinned_place(body, bone_step, 0.0, e, p) - kinematic_shape_rate * displacement
     share = 1.0 - body.velocity_lag[row(e, body.velocity_lag.shape[0]), p]
     u[e, body.first + p] = u[e, body.first + p] + share * (k - vk[e, body.first + p])
     vk[e, body.first + p] = k

@@ -22,6 +22,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.controller import implicit_velocity, pull_denominator, pull_gain
+from piavatar_envs.avatar.correctives import corrected_rest, correction_rate
 from piavatar_envs.avatar.kinematics import pose_bones
 from piavatar_envs.avatar.pose_control.bones import carry_anchor, carry_bone, write_record
 from piavatar_envs.avatar.pose_control.root import axial, free_motion, hold_root, is_free, lay_command
@@ -111,11 +112,12 @@ def command_body(
     free = is_free(control, root.released[e])
     released = root.released[e] != 0
     center = w.bones.center[e, 0]
+    elapsed = float(step) / float(control.num_substeps)
     for p in range(body.count):
         at = vector_at(x, e, body.first + p)
         before = vector_at(u, e, body.first + p)
         command_particle(
-            body, control, at, before, w.record, center, released, e, p, u, motion, kinematic, w.pull, w.lean
+            body, control, at, before, w.record, center, released, elapsed, e, p, u, motion, kinematic, w.pull, w.lean
         )
     if free:
         for c in range(chunks):
@@ -254,6 +256,7 @@ def command_particle(
     record: wp.array2d(dtype=vec44),
     center: wp.vec3,
     released: bool,
+    elapsed: float,
     e: int,
     p: int,
     # in and out
@@ -267,13 +270,14 @@ def command_particle(
     """Write the kinematic velocity of a particle, its pull [m/s] and its displacement to the commanded pose [m].
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
-    that contact has caused along with the bone. Flesh with a velocity lag misses its share of every change of that
-    velocity. ``at`` is the particle's position and ``before`` its velocity; the bones' blended velocity is that at
-    ``center``, the pelvis'.
+    that contact has caused along with the bone. The rest pose is that when a share ``elapsed`` of the control step is
+    over. Flesh with a velocity lag misses its share of every change of that velocity. ``at`` is the particle's position
+    and ``before`` its velocity; the bones' blended velocity is that at ``center``, the pelvis'.
     """
     velocity_lag = number_at(body.velocity_lag, row(e, body.velocity_lag.shape[0]), p)
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    s = blend_records(record, e, body.skin, p, rest)
+    rest = corrected_rest(body, elapsed, e, p)
+    rate = correction_rate(body, 1.0 / control.control_dt, e, p)
+    s = blend_records(record, e, body.skin, p, rest, rate, control.dt)
     displacement = at - blended_vector(s, AT_PLACE)
     turn = blended_turn(s)
     k = blended_vector(s, AT_STEP) + turn * displacement
@@ -300,6 +304,7 @@ def command_particles(
     record: wp.array2d(dtype=vec44),
     bones: RigidFits,
     released: wp.array(dtype=int),
+    elapsed: float,
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -329,7 +334,9 @@ def command_particles(
         n = wp.min(p + threads, last)
         following = vector_at(x, e, body.first + n)
         following_u = vector_at(u, e, body.first + n)
-        command_particle(body, control, at, before, record, center, gone, e, p, u, motion, kinematic, pull, lean)
+        command_particle(
+            body, control, at, before, record, center, gone, elapsed, e, p, u, motion, kinematic, pull, lean
+        )
         p += threads
 
 

@@ -291,13 +291,13 @@ class ArticulatedBody:
         model, w, fit = self.model, self._workspace, self.mass.is_due(step)
         if step == 0:
             self.record_pose(graph, state)
-        self._record_pull(graph, state)
+        self._record_pull(graph, state, step / model.num_substeps)
         if fit:
             self._record_mass(graph, state)
         inputs = [self.body, model.step.dt, 1.0 / model.control_dt, 3 if fit else 2]
         inputs += [self.target, self.springs, self.tissue, self.strength]
         self._record_stage(graph, act, inputs, state, self._ground(scratch), self.support)
-        inputs = [self.body, model.step.dt, state.x, w, state.failure]
+        inputs = [self.body, model.step.dt, (step + 1) / model.num_substeps, state.x, w, state.failure]
         graph.launch(split_velocity, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
     def _ground(self, scratch: Scratch) -> Ground:
@@ -312,11 +312,15 @@ class ArticulatedBody:
             sensors=scratch.sensors,
         )
 
-    def _record_pull(self, graph: LaunchGraph, state: State) -> None:
-        """Append the pass that pulls particles to the bones, and sums the momenta that are projected on the joints."""
+    def _record_pull(self, graph: LaunchGraph, state: State, elapsed: float) -> None:
+        """Append the pass that pulls particles to the bones, and sums the momenta that are projected on the joints.
+
+        A share ``elapsed`` of the control step is over.
+        """
         block = PARTITION_THREADS if self.threads > 1 else 1
         dim = (self.model.num_envs, self._partitions.start.shape[0] - 1, block)
-        inputs = [self.body, self._partitions, self.model.step.dt, self.model.particles.mass]
+        model = self.model
+        inputs = [self.body, self._partitions, model.step.dt, elapsed, 1.0 / model.control_dt, model.particles.mass]
         inputs += [state.x, self.attachment, state.failure, self._scratch]
         graph.launch(
             attach_flesh, dim, inputs, [state.u, state.kinematic, self._workspace], block_dim=PARTITION_THREADS

@@ -23,6 +23,7 @@ from piavatar_envs.avatar.body.muscles import (
 )
 from piavatar_envs.avatar.body.passive import passive_moments
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.avatar.correctives import predict_joints
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple
@@ -251,6 +252,8 @@ class TorqueController:
         """Append the start of a control step: strength and springs for the current bodies."""
         avatar, joints = self.avatar, self.joints
         avatar.record_clear_support(graph)
+        inputs = [avatar.body, avatar.model.control_dt, joints.pose, self.state.velocity]
+        avatar.record_corrections(graph, predict_joints, inputs)
         inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, self.assist, avatar.state.released]
         graph.launch(
             set_springs,

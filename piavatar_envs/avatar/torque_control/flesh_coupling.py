@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.controller import implicit_velocity
+from piavatar_envs.avatar.correctives import corrected_rest, correction_rate
 from piavatar_envs.avatar.segment_sums import (
     PARTITION_THREADS,
     Partitions,
@@ -49,9 +50,12 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def pulled_rest(body: Body, e: int, p: int, w: TorqueWorkspace):
-    """Return the rest position that a particle is pulled to [m], with the slip of a firm particle."""
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+def pulled_rest(body: Body, elapsed: float, e: int, p: int, w: TorqueWorkspace):
+    """Return the rest position that a particle is pulled to when a share ``elapsed`` of the control step is over [m].
+
+    That of a firm particle has its slip.
+    """
+    rest = corrected_rest(body, elapsed, e, p)
     if p < w.slip.shape[1]:
         rest += vector_at(w.slip, e, p)
     return rest
@@ -77,6 +81,8 @@ def attach_flesh(
     body: Body,
     partitions: Partitions,
     dt: float,
+    elapsed: float,
+    per_time: float,
     mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
     rate: wp.array2d(dtype=float),
@@ -93,7 +99,8 @@ def attach_flesh(
     :func:`~piavatar_envs.avatar.torque_control.joint_motion.motion_apart` of particles that several bones move, and
     ``spin`` the displacements to the skinned places, both for :func:`split_velocity`. The pull is implicit in time and
     critically damped, with ``rate`` [1/s]; a rate of 0 leaves a velocity exactly as it is. The moments are those of
-    the velocity that the pull removes, of the remaining velocity, and of the displacements to the skinned places.
+    the velocity that the pull removes, of the remaining velocity, and of the displacements to the skinned places. The
+    rest pose is that when a share ``elapsed`` of the control step is over; ``per_time`` is one over its time [1/s].
 
     Over ``(num_envs, partitions, PARTITION_THREADS)``, a CUDA block a partition; on a CPU one thread has the only one.
     """
@@ -119,7 +126,8 @@ def attach_flesh(
         v = vector_at(u, e, n) + vector_at(driven.vk, e, n)
         m = number_at(mass, r, n)  # loaded before any store, to avoid waiting for it
         own_rate = number_at(rate, row(e, rate.shape[0]), p)
-        now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w))
+        rate_inside = correction_rate(body, per_time, e, p)
+        now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, elapsed, e, p, w), rate_inside)
         apart = wp.vec3()
         if p >= body.alone:
             apart = motion_apart(now)
@@ -139,6 +147,7 @@ def attach_flesh(
 def split_velocity(
     body: Body,
     dt: float,
+    elapsed: float,
     x: wp.array2d(dtype=wp.vec3),
     w: TorqueWorkspace,
     failure: wp.array(dtype=int),
@@ -152,6 +161,7 @@ def split_velocity(
     places, and turns its displacement from them. Moved along ``J qdot`` of the substep's beginning, a particle that
     turns by ``theta`` would end ``1 + theta^2 / 2`` times as far from its axis; ``u`` would have to lead it back, and
     its gradient would strain the flesh, always in the same sense.
+    At the end a share ``elapsed`` of the control step is over.
 
     The total velocity is ``u`` plus the bones' motion in ``steps``, about the pelvis joint at the
     beginning, plus the motion apart that :func:`attach_flesh` leaves in ``vk``. ``steps`` has the spin at the midpoint,
@@ -172,7 +182,7 @@ def split_velocity(
         way = vector_at(driven.spin, e, n)
         apart = vector_from(driven.vk, body.first + body.alone, e, n)
         steps = blend_steps(w.steps, e, body.skin, p)
-        end = blend_places(w.end, e, body.skin, p, pulled_rest(body, e, p, w))
+        end = blend_places(w.end, e, body.skin, p, pulled_rest(body, elapsed, e, p, w))
         spin = wp.vec3(steps[6], steps[7], steps[8])
         turn = wp.cross(spin, way)
         vk = (end - way - arm) / dt - turn - 0.5 * dt * wp.cross(spin, turn)
@@ -201,7 +211,7 @@ def find_places(
     """Write the skinned places of all particles [m], relative to the pelvis joint; over ``(num_envs, particles)``."""
     e, p = wp.tid()
     if failure[e] == 0:
-        set_vector(at, e, p, skinned_place(body, place, e, p))
+        set_vector(at, e, p, skinned_place(body, place, 1.0, e, p))
 
 
 @wp.kernel
@@ -231,7 +241,7 @@ def put_in_place(
         return
     p = firm[own[1]]
     q = body.first + p
-    at = keep_outside(boundaries, e, vector_at(position, e, 0) + skinned_place(body, place, e, p))
+    at = keep_outside(boundaries, e, vector_at(position, e, 0) + skinned_place(body, place, 1.0, e, p))
     way = at - vector_at(x, e, q)
     affine = affine_after_move(grid, matrix_at(C, e, q), way, vector_at(u, e, q) + vector_at(vk, e, q))
     slipped = vector_at(slip, e, p) + blend_back(place, e, body.skin, p, way)

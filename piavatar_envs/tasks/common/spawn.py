@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.correctives import displacement_of
 from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skinning import bones_of, weights_of
@@ -81,9 +82,8 @@ class Grounding:
             [body, 0.0, state.command_rotation, state.command_root, still, still[:, 0], threads],
             [self._rotation, self._position],
         )
-        graph.launch(
-            find_lowest, (n, avatar.num_points), [env.mask, body, self._rotation, self._position], [self._lowest]
-        )
+        inputs = [env.mask, body, state.command_rotation, self._rotation, self._position]
+        graph.launch(find_lowest, (n, avatar.num_points), inputs, [self._lowest])
         graph.launch(stand_on_ground, n, [env.episodes, self._lowest], [state.command_root])
 
 
@@ -160,6 +160,7 @@ def begin_lowest(lowest: wp.array2d(dtype=float)):
 def find_lowest(
     mask: wp.array(dtype=wp.bool),
     body: Body,
+    local: wp.array2d(dtype=wp.quat),
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
     # in and out
@@ -170,12 +171,13 @@ def find_lowest(
     if not mask[e]:
         return
     rest = body.rest[row(e, body.rest.shape[0]), p]
+    bent = rest + displacement_of(body, local, e, p)
     joint = bones_of(body.skin, p)
     weight = weights_of(body.skin, p)
     height = float(0.0)
     for n in range(4):
         if weight[n] > 0.0:
-            arm = rest - body.rest_joint[row(e, body.rest_joint.shape[0]), joint[n]]
+            arm = bent - body.rest_joint[row(e, body.rest_joint.shape[0]), joint[n]]
             height += weight[n] * (position[e, joint[n]] + wp.quat_rotate(rotation[e, joint[n]], arm))[2]
     wp.atomic_min(lowest, e, 0, height)
     wp.atomic_min(lowest, e, 1, rest[2])
