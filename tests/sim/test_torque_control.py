@@ -281,7 +281,7 @@ def test_legs_bear_what_stands_on_them(make_batch, name):
     weight = np.cross(x - axis, np.array([0.0, 0.0, -9.81]) * mass[:, None]).sum(0)
     held = pelvis.torque.numpy()[0] + np.cross(at[0] - axis, pelvis.force.numpy()[0])
     above = weight - weight_about_joints(batch)[joints].sum(0) + held
-    assert above[0] > 15.0  # [N m]
+    assert above[0] > 10.0  # [N m]
     assert (spring_torques(batch) + tissue_torques(batch))[joints, 0].sum() == pytest.approx(above[0], rel=0.04)
 
 
