@@ -236,8 +236,8 @@ def jerk_root(action: np.ndarray, step: int, _rng: np.random.Generator) -> None:
 #: Task, settings, action and steps by name.
 MOTIONS: dict[str, tuple[str, dict, Callable[[np.ndarray, int, np.random.Generator], None], int]] = {
     "kick": ("Reach", {}, kick, 10),
-    "random": ("KickBall", {}, full_scale, 25),
-    "root": ("TrackMotion", {"motion": "t_pose", "impulse": 0.0}, jerk_root, 6),
+    "random": ("KickBall", {"bound_motion": True}, full_scale, 25),
+    "root": ("TrackMotion", {"motion": "t_pose", "impulse": 0.0, "bound_motion": True}, jerk_root, 6),
     "pd": ("Stand", {"control": "pd", "root_assist": 0.0}, full_scale, 25),
 }
 
@@ -280,7 +280,8 @@ def sag_pose(options: Options) -> Iterator[Quantity]:
     """Let soft flesh hang on bones: it has weight, as under pd, where the joints carry the bones."""
     sags = {}
     for control in ("pose", "pd"):
-        probe = Probe.under(options, control, young_modulus=1.0e4, scene={"ground": False})
+        settings = {"root": "weight"} if control == "pose" else {}
+        probe = Probe.under(options, control, young_modulus=1.0e4, scene={"ground": False}, **settings)
         probe.run(SETTLING)
         sags[control] = 1e3 * float(probe.displacement().mean())
     yield at_least("mean sag over that under pd", sags["pose"] / sags["pd"], 0.5)

@@ -234,7 +234,7 @@ class Probe(Measurements):
     def under(cls, options: Options, control: str, held: bool = True, **settings: Any) -> Probe:
         """Build a body that stands under ``control``; ``held`` says whether its pelvis is."""
         if control == "pose":
-            return cls.of(options, "Reach", root="wrench" if held else "free", **settings)
+            return cls.of(options, "Reach", **({"root": "wrench" if held else "free"} | settings))
         return cls.of(options, "Stand", control=control, root_assist=float(held), pose_noise=0.0, **settings)
 
     def step(self, action: np.ndarray | None = None) -> dict[str, Any]:

@@ -93,7 +93,7 @@ class Rig:
         )
         self.state, self.scratch = allocate(self.model)
         self.avatar = Avatar(self.points, 0, self.model)
-        self.controller = PoseController(self.avatar, pose_control(control, self.model))
+        self.controller = PoseController(self.avatar, self.points, pose_control(control, self.model))
         self._record()
         self.reset()
 

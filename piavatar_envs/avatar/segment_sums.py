@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.types import Body, PoseControl
-from piavatar_envs.core.arrays import float_at, int_at, number_at, vec12, vec16, vector_at
+from piavatar_envs.core.arrays import float_at, int_at, number_at, vec8, vec12, vec16, vector_at
 from piavatar_envs.core.cuda_intrinsics import BLOCK, place_in_chunks, sum_threads12
 from piavatar_envs.mpm.types import Particles, row
 
@@ -154,6 +154,12 @@ def store_one(into: wp.array2d(dtype=vec12), e: int, share: wp.vec4i, value: vec
     ...
 
 
+@wp.func_native(_store(6, "((float*)(into.data + n))[lane] = part[0];") + _ALONE)
+def store_wrench(into: wp.array2d(dtype=vec8), e: int, share: wp.vec4i, value: vec8):
+    """Store the sum of the first six numbers like :func:`store_both`."""
+    ...
+
+
 @wp.func_native(_store(16, _TWO) + _ALONE)
 def store_moments(into: wp.array2d(dtype=vec16), e: int, share: wp.vec4i, value: vec16):
     """Store the sum of sixteen numbers like :func:`store_both`."""
@@ -287,16 +293,52 @@ def sum_corrections(
     center: wp.array2d(dtype=wp.vec3),
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
+    jump: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     threads: int,
     # out
     corrections: wp.array2d(dtype=vec12),
+    jumps: wp.array2d(dtype=vec8),
 ):
-    """Run :func:`chunk_corrections` for every chunk, over ``(num_envs, warps of the quarters, threads)``."""
+    """Run :func:`chunk_corrections` and, if ``jumps`` has columns, :func:`chunk_jumps` for every chunk.
+
+    Over ``(num_envs, warps of the quarters, threads)``.
+    """
     i, j, k = wp.tid()
     e, share = own_share(body.quarters, i, j, k, threads)
     if failure[e] == 0:
         chunk_corrections(body, particles, x, center, pull, lean, e, share, corrections)
+        if jumps.shape[1] > 0:
+            chunk_jumps(body, particles, x, center, jump, e, share, jumps)
+
+
+@wp.func
+def chunk_jumps(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    center: wp.array2d(dtype=wp.vec3),
+    jump: wp.array2d(dtype=wp.vec3),
+    e: int,
+    share: wp.vec4i,
+    # out
+    jumps: wp.array2d(dtype=vec8),
+):
+    """Sum the momenta of commanded changes of velocity in one chunk, like :func:`chunk_corrections`."""
+    origin = center[e, share[1] & 255]
+    r = row(e, particles.mass.shape[0])
+    P = wp.vec3()
+    L = wp.vec3()
+    last = share[3] - 1
+    n = share[2]
+    while n <= last:
+        for _ in range(AT_ONCE):
+            p, weight = entry_of(body, n, last)
+            a = (weight * number_at(particles.mass, r, body.first + p)) * vector_at(jump, e, p)
+            P += a
+            L += wp.cross(vector_at(x, e, body.first + p) - origin, a)
+            n += share[1] >> 8
+    store_wrench(jumps, e, share, vec8(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0))
 
 
 @wp.func

@@ -101,8 +101,10 @@ class PoseControl:
     gravity: wp.vec3
     # root wrench
     root_rate: float  # 0: none
+    bones_bear: int  # 1: the root's support acts at the bones, which bear the flesh; 0: at every particle
     max_root_force: float  # [m/s^2], a force limit over the mass
     max_root_torque: float  # [m^2/s^2], a torque limit over the mass
+    bound_motion: int  # 1: both limits bound the momentum of commanded motion, too
     release_tilt_cos: float
     release_distance: float  # horizontal [m]
     release_height: float  # [m]
@@ -135,6 +137,8 @@ class RemovedMotion:
     velocity: wp.array(dtype=wp.vec3)
     turn: wp.array(dtype=wp.mat33)  # (R - I) / dt [1/s]
     center: wp.array(dtype=wp.vec3)
+    turning: wp.array(dtype=wp.vec3)  # angular momentum of what was taken out, about the centre [N m s]
+    acceleration: wp.array(dtype=wp.vec3)  # of the spin, at constant angular momentum [rad/s^2]
 
 
 @wp.struct
@@ -173,10 +177,13 @@ class Command:
 
 @wp.struct
 class Wrench:
-    """Acceleration of the whole body by the root wrench in a substep; ``(num_envs,)``."""
+    """Pull of the root in a substep, and what it still owes to commanded motion; ``(num_envs,)``."""
 
-    linear: wp.array(dtype=wp.vec3)  # acceleration of its centre [m/s^2]
-    angular: wp.array(dtype=wp.vec3)  # angular acceleration [rad/s^2]
+    force: wp.array(dtype=wp.vec3)  # of the pull and against gravity, bounded [N]
+    torque: wp.array(dtype=wp.vec3)  # of the pull about the body's centre, bounded [N m]
+    # impulses of commanded motion that the bounds have put off, in this control step
+    owed: wp.array(dtype=wp.vec3)  # [N s]
+    owed_turn: wp.array(dtype=wp.vec3)  # [N m s]
 
 
 @wp.struct
@@ -212,6 +219,10 @@ class PoseWorkspace:
     record: wp.array2d(dtype=vec44)  # (num_envs, bones) records that particles blend
     pull: wp.array2d(dtype=wp.vec3)  # (num_envs, count) velocity change by shape preservation and tone [m/s]
     lean: wp.array2d(dtype=wp.vec3)  # (num_envs, count) displacement from the carried to the commanded pose [m]
+    # (num_envs, count) change of velocity as commanded [m/s]; without columns if no root is held, like their sums
+    jump: wp.array2d(dtype=wp.vec3)
+    jumps: wp.array2d(dtype=vec8)  # (num_envs, chunks) their momenta
+    load: wp.array(dtype=float)  # (count,) weight and support over mass and gravity; empty unless bones bear the flesh
     corrections: wp.array2d(dtype=vec12)  # (num_envs, chunks)
     bone_corrections: wp.array2d(dtype=vec12)  # (num_envs, bones) their sums
     change: wp.array2d(dtype=vec8)  # (num_envs, bones) correction field
@@ -226,7 +237,7 @@ class AvatarState:
     goal_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local rotations at the end of this control step
     goal_root: wp.array(dtype=wp.vec3)  # (num_envs,) pelvis position to reach [m]
     released: wp.array(dtype=int)  # (num_envs,) 1 once the root is no longer held
-    wrench_force: wp.array(dtype=wp.vec3)  # (num_envs,) mean force on the root in the last control step [N]
+    wrench_force: wp.array(dtype=wp.vec3)  # (num_envs,) mean external force on the root in the last control step [N]
     wrench_torque: wp.array(dtype=wp.vec3)  # (num_envs,) mean torque on it [N m]
     # (num_envs, bones) local rotations that the correctives of the rest pose suit at the end of the control step
     corrected_rotation: wp.array2d(dtype=wp.quat)

@@ -201,8 +201,10 @@ class PoseControlConfig(BaseModel):
     joint_speed_limit: float = Field(
         4.0, gt=0.0, le=50.0, description="fastest rotation an action of 1 commands about a joint's axis [rad/s]"
     )
-    root: Literal["wrench", "free"] = Field(
-        "wrench", description="wrench (a bounded force and torque hold the commanded root) or free (nothing does)"
+    root: Literal["wrench", "weight", "free"] = Field(
+        "wrench",
+        description="wrench (a bounded force and torque hold the commanded root, and every particle of the body "
+        "against gravity), weight (they hold the bones, on which the flesh hangs by its weight) or free (nothing does)",
     )
     free_motion: bool | None = Field(
         None,
@@ -212,6 +214,11 @@ class PoseControlConfig(BaseModel):
     max_root_force: float = Field(2.0, ge=0.0, le=1000.0, description="largest root force, in body weights [m g]")
     max_root_torque: float = Field(
         0.7, ge=0.0, le=1000.0, description="largest root torque, in metres of body weight [m * m g]"
+    )
+    bound_motion: bool = Field(
+        False,
+        description="whether the root's limits also bound the momentum of commanded motion, which then comes as fast "
+        "as they allow; otherwise it comes at once, at any force",
     )
     release_tilt: float = Field(
         math.radians(45.0), gt=0.0, le=math.pi, description="tilt error at which the root wrench is released [rad]"

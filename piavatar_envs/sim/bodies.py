@@ -183,9 +183,9 @@ class Flesh:
             ConfigError: torque control or a held root with a decoupling of one velocity.
         """
         control = self.control
-        held = control.mode != "pose" or control.root == "wrench"
+        held = control.mode != "pose" or control.root != "free"
         if held and self.physics.decoupling in ("paper", "none"):
-            what = "root='wrench'" if control.mode == "pose" else f"mode={control.mode!r}"
+            what = f"root={control.root!r}" if control.mode == "pose" else f"mode={control.mode!r}"
             remedy = "split or no_stress" + (", or control.root=free" if control.mode == "pose" else "")
             raise ConfigError(
                 f"control.{what} needs two velocities: physics.decoupling={self.physics.decoupling!r} has one; use "
@@ -297,9 +297,11 @@ def pose_control(settings: PoseControlConfig, model: Model) -> PoseControl:
     control.tone_rate, control.damping = TONE_RATE * settings.tone, DAMPING
     control.free_motion = int(settings.moves_freely)
     control.gravity = model.step.gravity
-    control.root_rate = ROOT_RATE if settings.root == "wrench" else 0.0
+    control.root_rate = ROOT_RATE if settings.root != "free" else 0.0
+    control.bones_bear = int(settings.root == "weight")
     control.max_root_force = settings.max_root_force * STANDARD_GRAVITY
     control.max_root_torque = settings.max_root_torque * STANDARD_GRAVITY
+    control.bound_motion = int(settings.bound_motion)
     control.release_tilt_cos = math.cos(settings.release_tilt)
     control.release_distance, control.release_height = settings.release_distance, settings.release_height
     return control

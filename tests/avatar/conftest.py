@@ -250,6 +250,7 @@ def build_rig(
     num_substeps: int | None = None,
     half_width: float = 1.3,
     others: int = 0,
+    young_modulus: float = 1e5,
     colliders: Sequence[Collider] = (),
     keeps_volume: bool = False,
     **settings,
@@ -271,7 +272,7 @@ def build_rig(
         rest, volume = (np.stack([m[k] for m in morphed]) for k in (0, 1))
         joints = np.stack([body.joints for body in bodies])
     model = build_model(
-        MaterialPoints.uniform(np.pad(volume, ((0, 0), (others, 0)), mode="mean"), DENSITY),
+        MaterialPoints.uniform(np.pad(volume, ((0, 0), (others, 0)), mode="mean"), DENSITY, young_modulus),
         make_grid(
             (-half_width, -half_width, 0.0 if floor else -half_width), (half_width, half_width, 1.2 + half_width), dx
         ),
@@ -292,7 +293,8 @@ def build_rig(
     skinning = particles.skin_joints, particles.skin_weights
     points = BodyPoints(rest, mass, joints, *skinning, particles.bone, velocity_lag, correctives)
     avatar = Avatar(points, others, model)
-    controller = PoseController(avatar, pose_control(PoseControlConfig(**{"free_motion": False} | settings), model))
+    control = pose_control(PoseControlConfig(**{"free_motion": False} | settings), model)
+    controller = PoseController(avatar, points, control)
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
     reset_graph, step_graph = LaunchGraph(device), LaunchGraph(device)
     avatar.record_reset(reset_graph, state, mask)

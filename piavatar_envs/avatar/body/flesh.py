@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 
 #: Distance from the nearest bone particle at which flesh is fully soft [m].
 FULL_DEPTH = 0.10
@@ -63,6 +63,25 @@ def velocity_lag(amount: float, soft: np.ndarray) -> np.ndarray:
 def firmness(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
     """Return the share of particles in :data:`FIRM_JOINTS`, ``(P,)``, from joints and weights ``(P, 4)`` of each."""
     return np.where(np.isin(skin_joints, [joint_index(name) for name in FIRM_JOINTS]), skin_weights, 0.0).sum(1)
+
+
+def weight_loads(mass: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """Return what weight and support accelerate particles by, over gravity, if bones bear their flesh; ``(P,)``.
+
+    Flesh has its weight. The support of each bone's whole mass acts on the bone particles of that mass, and on the
+    flesh of :data:`FIRM_JOINTS`, so that the loads of a bone add up to nothing.
+
+    Args:
+        mass: of particles [kg], shape ``(P,)``.
+        bone: joint a particle tracks, -1 for flesh, shape ``(P,)``.
+        skin_joints: bones that move a particle, shape ``(P, 4)``.
+        skin_weights: their weights, shape ``(P, 4)``.
+    """
+    bears = np.where(bone >= 0, 1.0, firmness(skin_joints, skin_weights))
+    shares = mass[:, None] * skin_weights
+    whole, core = (np.bincount(skin_joints.ravel(), s.ravel(), NUM_JOINTS) for s in (shares, bears[:, None] * shares))
+    support = (skin_weights * (whole / np.maximum(core, 1e-9))[skin_joints]).sum(1)
+    return (1.0 - bears * support).astype(np.float32)
 
 
 def attachment_rates(

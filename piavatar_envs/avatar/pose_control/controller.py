@@ -10,6 +10,8 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.avatar import Avatar, reset_vectors
+from piavatar_envs.avatar.body.device import BodyPoints
+from piavatar_envs.avatar.body.flesh import weight_loads
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.correctives import turn_joints
 from piavatar_envs.avatar.pose_control.bones import begin_control, end_control
@@ -48,7 +50,14 @@ class PoseController:
     #: The end of a control step only takes over the command.
     moves_particles = False
 
-    def __init__(self, avatar: Avatar, parameters: PoseControl) -> None:
+    def __init__(self, avatar: Avatar, points: BodyPoints, parameters: PoseControl) -> None:
+        """Allocate the arrays of a substep.
+
+        Args:
+            avatar: the avatar.
+            points: the body that it was built from.
+            parameters: of the pulls and the root.
+        """
         self.avatar, self.parameters, model = avatar, parameters, avatar.model
         self.in_one_launch = wp.get_device(model.device).is_cpu
         self._injects = model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"])
@@ -68,7 +77,7 @@ class PoseController:
             root=state.command_root,
             goal_root=state.goal_root,
         )
-        chunks = avatar.body.chunk_bone.shape[0]
+        chunks, held = avatar.body.chunk_bone.shape[0], int(parameters.root_rate > 0.0)
         self.workspace = allocate(
             PoseWorkspace,
             n,
@@ -81,6 +90,9 @@ class PoseController:
             corrections=chunks,
             pull=avatar.num_points,
             lean=avatar.num_points,
+            load=self._loads(points),
+            jump=held * avatar.num_points,
+            jumps=held * chunks,
         )
         self.motion = wp.zeros((n, avatar.num_points), dtype=wp.vec3, device=model.device)
         w = self.workspace
@@ -89,6 +101,13 @@ class PoseController:
         # only injection blends whole matrices
         matrices = (n, NUM_JOINTS if self._injects else 0)
         self._bone_from, self._bone_step = (wp.zeros(matrices, dtype=wp.mat44, device=model.device) for _ in range(2))
+
+    def _loads(self, points: BodyPoints) -> wp.array:
+        """Return :func:`.weight_loads` on the device; empty where the root's support bears every particle."""
+        loads = np.zeros(0, np.float32)
+        if self.parameters.bones_bear:
+            loads = weight_loads(points.mass[0], points.bone, points.skin_joints, points.skin_weights)
+        return wp.array(loads, dtype=float, device=self.avatar.model.device)
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
         """Append the reset of the masked environments' :attr:`motion`; a control step begins from the tracked pose."""
@@ -140,20 +159,20 @@ class PoseController:
         inputs = [body, parameters, avatar.body_mass, step, self._chunk_threads, failure]
         graph.launch(prepare_body, (n, block), inputs, [w, root], block_dim=block)
 
-        inputs = [body, parameters, state.x, w.record, w.bones, released, step / model.num_substeps, failure]
-        outputs = [state.u, self.motion, state.kinematic, w.pull, w.lean]
+        inputs = [body, parameters, state.x, w.record, w.load, w.bones, released, step / model.num_substeps, failure]
+        outputs = [state.u, self.motion, state.kinematic, w.pull, w.lean, w.jump]
         graph.launch(command_particles, points, inputs, outputs, block_dim=BLOCK)
         if parameters.free_motion or parameters.root_rate > 0.0:  # a released root leaves an unsupported body
             inputs = [body, parameters, particles, state.x, state.vk, w.bones.center, released, failure, threads]
             graph.launch(sum_motion, (n, int(GROUPS), threads), inputs, [w.corrections], block_dim=BLOCK)
             graph.launch(remove_motions, (n, threads), [body, parameters, failure, threads], [w, root], block_dim=BLOCK)
 
-        inputs = [body, particles, state.x, w.bones.center, w.pull, w.lean, failure, threads]
-        graph.launch(sum_corrections, chunks, inputs, [w.corrections], block_dim=BLOCK)
+        inputs = [body, particles, state.x, w.bones.center, w.pull, w.lean, w.jump, failure, threads]
+        graph.launch(sum_corrections, chunks, inputs, [w.corrections, w.jumps], block_dim=BLOCK)
         if many_chunks:
             graph.launch(add_to_bones, bones, [body, failure, threads], [w], block_dim=threads)
         inputs = [body, parameters, self._chunk_threads, failure, threads]
-        graph.launch(correct_body, (n, threads), inputs, [w], block_dim=threads)
+        graph.launch(correct_body, (n, threads), inputs, [w, root], block_dim=threads)
         inputs = [body, parameters, state.x, w.pull, w.bones, w.change, w.removed, released, failure]
         graph.launch(apply_corrections, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 

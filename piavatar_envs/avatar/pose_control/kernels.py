@@ -2,7 +2,7 @@
 
 In order: fit rigid motions to the physical velocity, pose the bones and carry them by these motions, hold the root,
 write the kinematic velocity of every particle and pull its shape and pose, take the rigid part out of the commanded
-motion of unsupported bodies, and return the momentum of the pulls to the bones.
+motion of unsupported bodies, return the momentum of the pulls to the bones, and move the whole by the root's force.
 
 Two critically damped pulls act on the physical velocity, both implicit in time and both without net momentum:
 
@@ -25,8 +25,15 @@ from piavatar_envs.avatar.controller import implicit_velocity, pull_denominator,
 from piavatar_envs.avatar.correctives import corrected_rest, correction_rate
 from piavatar_envs.avatar.kinematics import pose_bones
 from piavatar_envs.avatar.pose_control.bones import carry_anchor, carry_bone, write_record
-from piavatar_envs.avatar.pose_control.root import axial, free_motion, hold_root, is_free, lay_command
-from piavatar_envs.avatar.segment_sums import add_chunks, chunk_corrections, chunk_moments, chunk_motion, share_of
+from piavatar_envs.avatar.pose_control.root import axial, free_motion, hold_root, is_free, lay_command, root_change
+from piavatar_envs.avatar.segment_sums import (
+    add_chunks,
+    chunk_corrections,
+    chunk_jumps,
+    chunk_moments,
+    chunk_motion,
+    share_of,
+)
 from piavatar_envs.avatar.skinning import (
     AT_LEAN,
     AT_PLACE,
@@ -117,8 +124,9 @@ def command_body(
         at = vector_at(x, e, body.first + p)
         before = vector_at(u, e, body.first + p)
         command_particle(
-            body, control, at, before, w.record, center, released, elapsed, e, p, u, motion, kinematic, w.pull, w.lean
-        )
+            body, control, at, before, w.record, w.load, center, released, elapsed, e, p, u, motion, kinematic, w.pull,
+            w.lean, w.jump,
+        )  # fmt: skip
     if free:
         for c in range(chunks):
             share = share_of(body.quarters, c, 0)
@@ -127,7 +135,9 @@ def command_body(
     for c in range(chunks):
         share = share_of(body.quarters, c, 0)
         chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, e, share, w.corrections)
-    correct_bones(body, control, 1, w, e, 0, 1)
+        if control.root_rate > 0.0:
+            chunk_jumps(body, particles, x, w.bones.center, w.jump, e, share, w.jumps)
+    correct_bones(body, control, 1, w, root, e, 0, 1)
     for p in range(body.count):
         at = vector_at(x, e, body.first + p)
         before = vector_at(u, e, body.first + p) + vector_at(w.pull, e, p)
@@ -254,6 +264,7 @@ def command_particle(
     at: wp.vec3,
     before: wp.vec3,
     record: wp.array2d(dtype=vec44),
+    load: wp.array(dtype=float),
     center: wp.vec3,
     released: bool,
     elapsed: float,
@@ -266,8 +277,12 @@ def command_particle(
     kinematic: Kinematic,
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
+    jump: wp.array2d(dtype=wp.vec3),
 ):
-    """Write the kinematic velocity of a particle, its pull [m/s] and its displacement to the commanded pose [m].
+    """Write the kinematic velocity of a particle, and what acts on its physical velocity.
+
+    That is its pull [m/s] and its displacement to the commanded pose [m]. If a root may be held, ``jump`` gets the
+    change of its velocity as commanded [m/s].
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
     that contact has caused along with the bone. The rest pose is that when a share ``elapsed`` of the control step is
@@ -286,14 +301,23 @@ def command_particle(
     relative = before - blended_velocity(s, at - center)
     pulled = implicit_velocity(control.shape_rate, control.dt, -displacement, relative) - relative
     way = blended_vector(s, AT_LEAN)
+    change = wp.vec3()
+    if control.root_rate > 0.0:
+        change = k - vector_at(kinematic.vk, e, body.first + p)
     if velocity_lag > 0.0:
         # a body that nothing supports could not take the reaction
         if control.free_motion == 0 and not released:
-            u[e, body.first + p] = before - velocity_lag * (k - motion[e, p])
+            missed = velocity_lag * (k - motion[e, p])
+            u[e, body.first + p] = before - missed
+            change -= missed
         motion[e, p] = k
     pulled += pull_gain(control.tone_rate, control.dt) * way
+    if load.shape[0] > 0 and not released:
+        pulled += (control.dt * load[p]) * control.gravity
     store_pair(kinematic.vk, kinematic.spin, e, body.first + p, k, -0.5 * axial(turn), True, True)
     store_pair(pull, lean, e, p, pulled, way, control.tone_rate > 0.0, True)
+    if control.root_rate > 0.0:
+        store_vector(jump, e, p, change, True)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 6))
@@ -302,6 +326,7 @@ def command_particles(
     control: PoseControl,
     x: wp.array2d(dtype=wp.vec3),
     record: wp.array2d(dtype=vec44),
+    load: wp.array(dtype=float),
     bones: RigidFits,
     released: wp.array(dtype=int),
     elapsed: float,
@@ -313,6 +338,7 @@ def command_particles(
     kinematic: Kinematic,
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
+    jump: wp.array2d(dtype=wp.vec3),
 ):
     """Run :func:`command_particle` for every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
@@ -335,7 +361,7 @@ def command_particles(
         following = vector_at(x, e, body.first + n)
         following_u = vector_at(u, e, body.first + n)
         command_particle(
-            body, control, at, before, record, center, gone, elapsed, e, p, u, motion, kinematic, pull, lean
+            body, control, at, before, record, load, center, gone, elapsed, e, p, u, motion, kinematic, pull, lean, jump
         )
         p += threads
 
@@ -346,11 +372,13 @@ def remove_motion(
 ):
     """Compute the rigid part that is subtracted from commanded motion; zero for a supported body."""
     if is_free(control, root.released[e]):
-        free_motion(body, control, w.corrections, w.bones, w.whole, e, thread, threads, w.removed, w.wrench)
+        free_motion(body, control, w.corrections, w.bones, w.whole, e, thread, threads, w.removed)
     elif thread == 0:  # an earlier value would enter the carry
         w.removed.velocity[e] = wp.vec3(0.0)
         w.removed.turn[e] = wp.mat33()
         w.removed.center[e] = wp.vec3(0.0)
+        w.removed.turning[e] = wp.vec3(0.0)
+        w.removed.acceleration[e] = wp.vec3(0.0)
 
 
 @wp.kernel
@@ -389,12 +417,16 @@ def blend_corrections(
     body: Body,
     control: PoseControl,
     corrections: wp.array2d(dtype=vec12),
+    jumps: wp.array2d(dtype=vec8),
     bones: RigidFits,
     whole: RigidFit,
-    wrench: Wrench,
+    removed: RemovedMotion,
     e: int,
     thread: int,
     threads: int,
+    # in and out
+    wrench: Wrench,
+    root: RootState,
     # out
     change: wp.array2d(dtype=vec8),
 ):
@@ -425,9 +457,10 @@ def blend_corrections(
         P += p
         L += bones.inertia[e, b] * dw + l1 + wp.cross(arm, p)
     total = sum_threads12(vec12(m, P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
-    # these changes are internal, so their rigid part is subtracted; only the root wrench moves the whole body
-    V = dt * wrench.linear[e] - wp.vec3(total[1], total[2], total[3]) / total[0]
-    W = dt * wrench.angular[e] - spin_of(whole.inertia[e], wp.vec3(total[4], total[5], total[6]))
+    # these changes are internal, so their rigid part is subtracted; only the root moves the whole body
+    V, W = root_change(body, control, total[0], jumps, bones, removed, whole, e, thread, threads, wrench, root)
+    V -= wp.vec3(total[1], total[2], total[3]) / total[0]
+    W -= spin_of(whole.inertia[e], wp.vec3(total[4], total[5], total[6]))
     rigid = bone_change(V, W, bones.center[e, 0] - whole.center[e])
     for b in range(thread, body.parent.shape[0], threads):
         change[e, b] = change[e, b] + rigid
@@ -435,14 +468,24 @@ def blend_corrections(
 
 @wp.func
 def correct_bones(
-    body: Body, control: PoseControl, chunk_threads: int, w: PoseWorkspace, e: int, thread: int, threads: int
+    body: Body,
+    control: PoseControl,
+    chunk_threads: int,
+    w: PoseWorkspace,
+    root: RootState,
+    e: int,
+    thread: int,
+    threads: int,
 ):
     """Compute the change of the bones' motion from the chunks' corrections; 0 ``chunk_threads``: already summed."""
     if chunk_threads > 0:
         for b in range(thread // chunk_threads, body.parent.shape[0], threads // chunk_threads):
             add_chunks(body, w.corrections, e, b, thread % chunk_threads, chunk_threads, w.bone_corrections)
         sync_threads(threads)
-    blend_corrections(body, control, w.bone_corrections, w.bones, w.whole, w.wrench, e, thread, threads, w.change)
+    blend_corrections(
+        body, control, w.bone_corrections, w.jumps, w.bones, w.whole, w.removed, e, thread, threads, w.wrench, root,
+        w.change,
+    )  # fmt: skip
 
 
 @wp.kernel(launch_bounds=(int(WARP), BODIES_AT_ONCE))
@@ -454,11 +497,12 @@ def correct_body(
     threads: int,
     # in and out
     w: PoseWorkspace,
+    root: RootState,
 ):
     """Run :func:`correct_bones`, over ``(num_envs, threads)``, with a CUDA block a body."""
     e, thread = wp.tid()
     if failure[e] == 0:
-        correct_bones(body, control, chunk_threads, w, e, thread, threads)
+        correct_bones(body, control, chunk_threads, w, root, e, thread, threads)
 
 
 @wp.func

@@ -2,10 +2,15 @@
 
 A pose-controlled avatar does not balance itself; a six-degree-of-freedom wrench holds the commanded root instead. It is
 a rigid acceleration field over the whole body (no sag), with gravity fed forward and an implicit critically damped PD
-``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and is released until the next reset once
-the body has been pushed too far.
+``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is released until the next reset once the body has been
+pushed too far.
 
-Commanded motion of a body that nothing supports must carry neither momentum nor angular momentum.
+Commanded motion changes the momentum of the body, which the wrench gives too. With ``bound_motion`` the whole is
+bounded: an impulse beyond the bound comes back to the body as a recoil of its physical velocity, and is given later in
+the control step, as far as the bound allows.
+
+Commanded motion of a body that nothing supports must carry neither momentum nor angular momentum. When its root is
+released, a body keeps the momenta that commanded motion has had until then.
 """
 
 from __future__ import annotations
@@ -28,8 +33,8 @@ from piavatar_envs.avatar.types import (
     RootState,
     Wrench,
 )
-from piavatar_envs.core.arrays import vec12, vec16
-from piavatar_envs.core.cuda_intrinsics import sum_threads12, sum_threads16
+from piavatar_envs.core.arrays import vec8, vec12, vec16
+from piavatar_envs.core.cuda_intrinsics import sum_threads6, sum_threads12, sum_threads16
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -68,9 +73,12 @@ def hold_root(
     # out
     wrench: Wrench,
 ):
-    """Compute the acceleration of the body by the root wrench, and accumulate its mean over the control step."""
-    wrench.linear[e] = wp.vec3(0.0)
-    wrench.angular[e] = wp.vec3(0.0)
+    """Compute the pull of the root, or release it beyond its limits; a control step begins without debt."""
+    wrench.force[e] = wp.vec3(0.0)
+    wrench.torque[e] = wp.vec3(0.0)
+    if fraction == 0.0:
+        wrench.owed[e] = wp.vec3(0.0)
+        wrench.owed_turn[e] = wp.vec3(0.0)
     if control.root_rate <= 0.0:
         return
     G = carry.rotation[e, 0]
@@ -89,18 +97,82 @@ def hold_root(
         root.released[e] = 1
     if root.released[e] != 0:
         return
-    I = whole.inertia[e]
     a = critical_pull(control.root_rate, control.dt, error, whole.velocity[e]) - control.gravity
-    a = clamp_length(a, control.max_root_force)
-    torque = I * critical_pull(control.root_rate, control.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
-    torque = clamp_length(torque, control.max_root_torque * mass)
-    if not (wp.isfinite(a) and wp.isfinite(torque)):
-        return  # the MPM substep flags the failure
-    wrench.linear[e] = a
-    wrench.angular[e] = wp.inverse(I) * torque
-    share = 1.0 / float(control.num_substeps)
-    root.wrench_force[e] = root.wrench_force[e] + share * mass * a
-    root.wrench_torque[e] = root.wrench_torque[e] + share * torque
+    turn = critical_pull(control.root_rate, control.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
+    wrench.force[e] = clamp_length(mass * a, control.max_root_force * mass)
+    wrench.torque[e] = clamp_length(whole.inertia[e] * turn, control.max_root_torque * mass)
+
+
+@wp.func
+def share_within(control: PoseControl, pull: wp.vec3, need: wp.vec3, limit: float):
+    """Return the share in [0, 1] of ``need`` that is given: what ``pull``, which is within the limit, leaves room for.
+
+    It is all where the limit does not bound commanded motion.
+    """
+    if control.bound_motion == 0:
+        return 1.0
+    n = wp.max(wp.length_sq(need), 1.0e-12)
+    along = wp.dot(pull, need)
+    room = wp.max(limit * limit - wp.length_sq(pull), 0.0)
+    return wp.clamp((wp.sqrt(along * along + n * room) - along) / n, 0.0, 1.0)
+
+
+@wp.func
+def root_change(
+    body: Body,
+    control: PoseControl,
+    mass: float,
+    jumps: wp.array2d(dtype=vec8),
+    bones: RigidFits,
+    removed: RemovedMotion,
+    whole: RigidFit,
+    e: int,
+    thread: int,
+    threads: int,
+    # in and out
+    wrench: Wrench,
+    root: RootState,
+):
+    """Return the change of velocity and spin of the whole body by the root, and accumulate the mean of its force.
+
+    ``jumps`` are the changes of momentum as commanded, before any rigid part was taken out.
+    """
+    dt = control.dt
+    if control.root_rate <= 0.0:
+        return wp.vec3(), dt * removed.acceleration[e]
+    P = wp.vec3()
+    L = wp.vec3()
+    for c in range(thread, body.chunk_bone.shape[0], threads):
+        s = jumps[e, c]
+        p = wp.vec3(s[0], s[1], s[2])
+        P += p
+        L += wp.vec3(s[3], s[4], s[5]) + wp.cross(bones.center[e, body.chunk_bone[c]] - whole.center[e], p)
+    s = sum_threads6(vec8(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0), threads)
+    P = wp.vec3(s[0], s[1], s[2]) - mass * removed.velocity[e]
+    L = wp.vec3(s[3], s[4], s[5]) - removed.turning[e]
+    force = wp.vec3()
+    torque = wp.vec3()
+    need = P + wrench.owed[e]
+    need_turn = L + wrench.owed_turn[e]
+    if root.released[e] == 0:
+        force = dt * wrench.force[e]
+        share = share_within(control, force, need, dt * mass * control.max_root_force)
+        force += share * need
+        need *= 1.0 - share
+        torque = dt * wrench.torque[e]
+        share = share_within(control, torque, need_turn, dt * mass * control.max_root_torque)
+        torque += share * need_turn
+        need_turn *= 1.0 - share
+    V = (force - P) / mass
+    W = spin_of(whole.inertia[e], torque - L)
+    if not (wp.isfinite(V) and wp.isfinite(W)):
+        return wp.vec3(), wp.vec3()  # the MPM substep flags the failure
+    if thread == 0:
+        wrench.owed[e] = need
+        wrench.owed_turn[e] = need_turn
+        root.wrench_force[e] = root.wrench_force[e] + force / control.control_dt
+        root.wrench_torque[e] = root.wrench_torque[e] + torque / control.control_dt
+    return V, W
 
 
 @wp.func
@@ -162,8 +234,6 @@ def free_motion(
     threads: int,
     # out
     removed: RemovedMotion,
-    # in and out
-    wrench: Wrench,
 ):
     """Compute the rigid part that is subtracted from the commanded motion of an unsupported body.
 
@@ -207,5 +277,6 @@ def free_motion(
     removed.velocity[e] = wp.vec3(t[1], t[2], t[3]) / t[0]
     removed.turn[e] = A
     removed.center[e] = whole.center[e]
+    removed.turning[e] = axial(K)
     W = whole.spin[e]
-    wrench.angular[e] = wrench.angular[e] - spin_of(I, wp.trace(moment) * W - moment * W)
+    removed.acceleration[e] = -spin_of(I, wp.trace(moment) * W - moment * W)
