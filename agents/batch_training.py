@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -20,6 +21,7 @@ from agents.command import read_options, script_hint
 from agents.config import MOST_ENVS, MOST_RUNS, EvaluationSettings, first_training_seed, load_resolved
 from agents.evaluate import Agent, play_with_baselines
 from agents.files import made
+from agents.interrupt import command, ended_by_interrupt
 from agents.report import Curve, conclude, draw_curve, versions
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import (
@@ -167,8 +169,9 @@ def run(
         with made(folder):
             checkpoint = Checkpoint(folder, name, config, options.device, options.resume)
             iterations_of(checkpoint, config.iterations)
-            learned = learn(config, task, folder, options.device, checkpoint)
-        evaluate_batch(name, config, find_task, learned, folder, options.device)
+            with ended_by_interrupt(partial(checkpoint.remedy, command(name, args, "--resume"))):
+                learned = learn(config, task, folder, options.device, checkpoint)
+                evaluate_batch(name, config, find_task, learned, folder, options.device)
     except (ConfigError, Diverged, OSError) as error:
         sys.exit(f"error: {error}")
 

@@ -23,6 +23,7 @@ import torch
 from pydantic import BaseModel
 
 from agents.files import CHECKPOINT, POLICIES, RESULTS, git_commit, hold, write_atomically
+from agents.interrupt import StopRequest
 from piavatar_envs.config import ConfigError
 from piavatar_envs.core.reading import UNREADABLE, first_line
 from piavatar_envs.doctor import package_version
@@ -46,6 +47,8 @@ class Checkpoint:
     Attributes:
         path: of the file.
         state: what it held when the run began, or None for a run from the start.
+        reached: how long the training was that the file holds; empty without a file.
+        stop: by which the training ends once it is written.
     """
 
     def __init__(self, folder: Path, script: str, config: BaseModel, device: str, resume: bool) -> None:
@@ -66,6 +69,7 @@ class Checkpoint:
         self.path = folder / CHECKPOINT
         hold(folder)
         self.state: dict[str, Any] | None = None
+        self.reached, self.stop = "", StopRequest()
         commit, _ = git_commit()
         self._about = {
             "script": script,
@@ -85,20 +89,33 @@ class Checkpoint:
                 f"delete {self.path} to lose it"
             )
         self.state = self._read()
+        self.reached = self._length(self.state)
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace the saved state by a new one: nested containers of tensors, arrays and plain values."""
         content = {"format": FORMAT, "about": self._about, "state": as_tensors(state)}
         write_atomically(self.path, lambda file: torch.save(content, file))
+        self.reached = self._length(state)
+
+    def remedy(self, command: str) -> str:
+        """Return what an interrupted training has reached, and how to go on.
+
+        Args:
+            command: line that resumes it.
+        """
+        if not self.reached:
+            return f"before the first checkpoint; nothing is kept, begin anew with {command}"
+        return f"after {self.reached}; go on with {command}"
+
+    def _length(self, state: Mapping[str, Any]) -> str:
+        """Return the length of a training in this state, for messages."""
+        for unit, length in (("steps", "total_steps"), ("iterations", "iterations")):
+            if unit in state:
+                return f"{state[unit]} of {self._about['config'][length]} {unit}"
+        return ""
 
     def _read(self) -> dict[str, Any]:
-        try:
-            content = load_weights(self.path, "cpu")
-        except UNREADABLE as error:
-            raise ConfigError(f"{self.path} cannot be read ({first_line(error)}); delete it to begin anew") from None
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            found = content.get("format") if isinstance(content, dict) else None
-            raise ConfigError(f"{self.path} has format={found}, this reads {FORMAT}; delete it to begin anew")
+        content = read_checkpoint(self.path)
         self._compare(content["about"])
         return content["state"]
 
@@ -123,6 +140,22 @@ class Checkpoint:
                 "go on otherwise than it would have",
                 stacklevel=4,
             )
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint: ``state``, and ``about`` the training that it is of.
+
+    Raises:
+        ConfigError: the file cannot be read, or has another format.
+    """
+    try:
+        content = load_weights(path, "cpu")
+    except UNREADABLE as error:
+        raise ConfigError(f"{path} cannot be read ({first_line(error)}); delete it to begin anew") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        found = content.get("format") if isinstance(content, dict) else None
+        raise ConfigError(f"{path} has format={found}, this reads {FORMAT}; delete it to begin anew")
+    return content
 
 
 def load_weights(path: Path, device: str) -> Any:

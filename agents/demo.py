@@ -1,17 +1,17 @@
 """``make demo``: PPO learns to reach on the CPU in ten minutes at most, from untrained to filmed.
 
-Plays zero, random and scripted actions, trains, plays the trained policy in the same episodes, and leaves in
-``runs/demo``: policy.zip, curve.png, before_after.mp4, config.yaml and results.json.
+Trains, plays zero, random, scripted and trained actions in the same episodes, and leaves in ``runs/demo``: policy.zip,
+curve.png, before_after.mp4, config.yaml and results.json. The exit status is 1 if nothing was learned.
 """
 
 from __future__ import annotations
 
 import copy
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import tyro
 from rich.console import Console
 
@@ -19,6 +19,7 @@ from agents.checkpoint import Diverged
 from agents.command import one_line_errors, read_options
 from agents.evaluate import Evaluation, baselines, evaluate, separated
 from agents.files import RESULTS, claim, hold
+from agents.interrupt import StopRequest, command, ended_by_interrupt
 from agents.play import film
 from agents.reach_ik import ReachIK
 from agents.report import draw_curve, show_table, versions, write_results
@@ -32,9 +33,11 @@ from piavatar_envs.sim.world import check_device
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "sb3" / "reach_ppo.yaml"
 FILM_EPISODES = 2
+#: Agents that are compared: zero, random, scripted and trained actions.
+PLAYED = 4
 #: Files that appear after the training.
 LATER = ("policy.zip", "curve.csv", "curve.png", "before_after.mp4")
-_RESERVE = 1.25  # margin on the estimated time after the training
+_RESERVE = 1.25  # margin on the estimated time after the training; half of all time at most is kept for it
 _FRAME = 0.1  # rendering and encoding a frame whose halves are drawn in parallel, on slow cores [s]
 
 
@@ -50,9 +53,9 @@ class Options:
     seed: int = 0
     #: where to simulate
     device: str = "cpu"
-    #: time for everything [s]; the training ends early where the machine is too slow for all steps
+    #: time for everything [s]; the training ends early where the machine is too slow, after half of it at the earliest
     seconds: float = 570.0
-    #: leave the video out
+    #: write a video of the arms before and after
     video: bool = True
 
 
@@ -76,46 +79,60 @@ class Outcome:
     separated: bool
 
 
-def run(options: Options, console: Console) -> Outcome:
+def run(options: Options, console: Console, stop: StopRequest | None = None) -> Outcome:
     """Run all of ``make demo``.
 
+    Args:
+        options: of the command line.
+        console: where to report.
+        stop: by which the training ends with a policy.
+
     Raises:
+        KeyboardInterrupt: Ctrl-C; if it was in the training, the policy is there.
         ConfigError: a setting that is unknown, of the wrong type or out of range; or the folder is not the demo's.
         ValueError: there is no such device.
         OSError: something cannot be written.
     """
-    begun = time.monotonic()
+    begun, stop = time.monotonic(), stop or StopRequest()
     config = demonstrated(options)
     claim(options.out, "demo", own=("policy.zip",))
     make = factory(config, options.device)
-    with console.status("compiling kernels (once; they are cached)"):
-        facts = prepare(make)
+    console.print(
+        f"{config.env_id}: PPO trains the arms for {config.total_steps} steps; all takes {options.seconds:g} s at most"
+    )
+    facts = prepare(make)
     seen = components(facts.layout, config.observe)
     options.out.mkdir(parents=True, exist_ok=True)
     hold(options.out)
-    console.print(f"{config.env_id}: kernels ready after {time.monotonic() - begun:.0f} s")
     venv = start_workers(make, config.num_workers)
     try:
-        references = play_references(config, venv, facts)
         # marks the folder as a demo's, which the next demo may replace, even if this one is stopped
         about = versions("demo", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
-        write_results(options.out / RESULTS, about, [evaluation for evaluation, _ in references], {})
+        write_results(options.out / RESULTS, about, [], {})
         for name in LATER:  # files of an earlier demo do not belong to this one's figures
             (options.out / name).unlink(missing_ok=True)
-        deadline = begun + options.seconds - _RESERVE * _time_after(options, config, facts, references)
         untrained = ppo.build(config.ppo, venv, seen, config.seed)
         before = policy_agent(copy.deepcopy(untrained.policy))
-        model, curve = train(config, venv, facts, options.out, deadline=deadline)
+
+        def deadline(steps: int, seconds: float) -> float:
+            if stop.made:
+                return begun
+            after = _RESERVE * time_after(options, config, facts, seconds / max(1, steps))
+            return begun + options.seconds - min(after, 0.5 * options.seconds)
+
+        with stop.listening():
+            model, curve = train(config, venv, facts, options.out, deadline=deadline)
+        stop.obey(f"{model.num_timesteps} of {config.total_steps} steps")
         if model.num_timesteps < config.total_steps:
             console.print(
                 f"training ended after {model.num_timesteps} of {config.total_steps} steps, because the demo may take "
                 f"{options.seconds:g} s on this machine; python -m agents.demo --seconds {3.0 * options.seconds:g} "
                 "gives it more"
             )
-        trained, _ = _timed_play("trained", policy_agent(model), config, venv)
+        references = play_references(config, venv, facts)
+        trained = _play("trained", policy_agent(model), config, venv)
     finally:
         venv.close()
-    references = [evaluation for evaluation, _ in references]
     estimates = {evaluation.agent: evaluation.estimate() for evaluation in (*references, trained)}
     draw_curve(options.out / "curve.png", curve.steps, curve.returns, estimates, f"PPO on {config.env_id}")
     if options.video:
@@ -162,41 +179,50 @@ def demonstrated(options: Options) -> TrainingConfig:
     return config
 
 
-def _timed_play(name: str, agent, config: TrainingConfig, venv) -> tuple[Evaluation, float]:
-    start = time.monotonic()
-    played = evaluate(name, agent, venv, config.evaluation.episodes, config.evaluation.first_seed)
-    return played, time.monotonic() - start
+def _play(name: str, agent, config: TrainingConfig, venv) -> Evaluation:
+    return evaluate(name, agent, venv, config.evaluation.episodes, config.evaluation.first_seed)
 
 
-def play_references(config: TrainingConfig, venv, facts: EnvFacts) -> list[tuple[Evaluation, float]]:
-    """Evaluate the agents that the trained policy is compared with, and return the time that each took [s]."""
+def play_references(config: TrainingConfig, venv, facts: EnvFacts) -> list[Evaluation]:
+    """Evaluate the agents that the trained policy is compared with."""
     size = len(facts.action_names)
     agents = {
         **baselines(size, config.evaluation.first_seed),
         "scripted IK": ReachIK(facts.layout, facts.action_names, facts.action_step, facts.control_dt),
     }
-    return [_timed_play(name, agent, config, venv) for name, agent in agents.items()]
+    return [_play(name, agent, config, venv) for name, agent in agents.items()]
 
 
-def _time_after(
-    options: Options, config: TrainingConfig, facts: EnvFacts, references: list[tuple[Evaluation, float]]
-) -> float:
-    """Estimate the time of the evaluation and video after the training, from the time of the references [s]."""
-    episode = max(e.steps for evaluation, _ in references for e in evaluation.episodes)
-    one = float(np.median([seconds for _, seconds in references]))  # the first also waits for the workers
-    if not options.video:
-        return one
+def time_after(options: Options, config: TrainingConfig, facts: EnvFacts, step: float) -> float:
+    """Estimate the time of the evaluations and the video after the training [s].
+
+    Args:
+        options: of the demo.
+        config: resolved.
+        facts: of the environment.
+        step: time of the training per control step [s], over all workers.
+    """
+    episode = config.env["episode_seconds"] / facts.control_dt
+    evaluations = PLAYED * config.evaluation.episodes * episode * step
     # the workers play an episode each at a time, the film two
-    step = one / (config.evaluation.episodes * episode)
-    return one + FILM_EPISODES * episode * (2.0 * step + _FRAME)
+    return evaluations + (FILM_EPISODES * episode * (2.0 * step + _FRAME) if options.video else 0.0)
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run the command line."""
+    """Run the command line; the exit status is 1 if nothing was learned."""
     options = read_options(Options, "demo", args)
     console = Console(highlight=False, soft_wrap=True)
-    with one_line_errors(ValueError, Diverged, OSError):
-        outcome = run(options, console)
+
+    stop = StopRequest()
+
+    def remedy() -> str:
+        again = f"begin anew with {command('demo', args)}"
+        if not stop.reached:
+            return f"before the end; {again}"
+        return f"after {stop.reached}; play what it has learned with python -m agents.play {options.out}, or {again}"
+
+    with ended_by_interrupt(remedy), one_line_errors(ValueError, Diverged, OSError):
+        outcome = run(options, console, stop)
     show_table(outcome.evaluations, console)
     verdict = "lies above" if outcome.separated else "does NOT lie above"
     console.print(f"The trained policy's interval {verdict} those of zero and of random actions.")
@@ -205,11 +231,12 @@ def main(args: list[str] | None = None) -> None:
         f"({outcome.train_steps_per_s:.0f} a second), {outcome.total_s:.0f} s in all"
     )
     files = "policy.zip, curve.png, before_after.mp4, config.yaml, results.json"
-    console.print(
-        f"in {options.out}: {files}"
-        if options.video
-        else f"in {options.out}: {files.replace(' before_after.mp4,', '')}"
-    )
+    console.print(f"in {options.out}: {files if options.video else files.replace(' before_after.mp4,', '')}")
+    if not outcome.separated:
+        sys.exit(
+            f"error: nothing was learned in {outcome.train_steps} steps that shows in "
+            f"{len(outcome.evaluations[0].episodes)} episodes; give it more time with --seconds, or more total_steps"
+        )
 
 
 if __name__ == "__main__":

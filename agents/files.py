@@ -7,7 +7,6 @@ import math
 import os
 import platform
 import subprocess
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
@@ -21,6 +20,7 @@ from piavatar_envs import doctor
 from piavatar_envs.config import ConfigError, dump_yaml
 from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.core.reading import reading
+from piavatar_envs.core.writing import check_writable
 
 try:
     import fcntl
@@ -105,23 +105,6 @@ def hold(folder: Path) -> None:
             raise ConfigError(f"another training writes to {folder}; end it, or write elsewhere with --out") from None
         return  # a file system without locks
     _HELD[path] = held
-
-
-def check_writable(path: Path) -> None:
-    """Refuse a file that could not be written, before there is content for it; leaves everything as it is.
-
-    Raises:
-        ConfigError: it is a folder, or nothing can be written there.
-    """
-    try:
-        if path.is_dir():
-            raise ConfigError(f"{path} is a folder; name a file in it")
-        if path.exists():
-            path.open("ab").close()
-        nearest = next(folder for folder in path.absolute().parents if folder.exists())
-        tempfile.TemporaryFile(dir=nearest).close()  # finds more than a check of permissions does
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be written ({error.strerror}); write elsewhere") from None
 
 
 def read_json(path: Path) -> Any:

@@ -1,8 +1,9 @@
 """Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
 
 Takes the folder of a run with one agent, by ``agents.rsl_rl.train`` (policy.pt) or ``agents.sb3.train`` (policy.zip),
-builds the environment of its config.yaml, and plays the episodes of its evaluation. With ``--film`` alone it plays no
-others; with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
+builds the environment of its config.yaml, and plays the episodes of its evaluation. Of an interrupted training it
+takes the policy in the checkpoint. With ``--film`` alone it plays no others; with ``--live`` it plays in a web browser
+instead, until Ctrl-C. Nothing in the files is unpickled.
 
 A video of one agent, or of two in the same episodes side by side.
 """
@@ -10,7 +11,6 @@ A video of one agent, or of two in the same episodes side by side.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -22,16 +22,18 @@ from rich.console import Console
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
+from agents.checkpoint import read_checkpoint
 from agents.command import one_line_errors, read_options
 from agents.config import EvaluationSettings, changed
 from agents.evaluate import Agent, begin_round, for_all_seats, play
-from agents.files import RESULTS, check_figures, check_writable
+from agents.files import CHECKPOINT, RESULTS, check_figures
 from agents.report import show_table, versions, write_results
 from agents.sb3.config import load_training
 from agents.sb3.workers import EnvFactory, start_workers
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.core.rng import check_seeds
+from piavatar_envs.core.writing import check_writable
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.envs.task import Task
@@ -42,7 +44,7 @@ from piavatar_envs.tasks import load_task
 
 @dataclass(frozen=True)
 class Run:
-    """A finished training, as read from its folder.
+    """A training, finished or interrupted, as read from its folder.
 
     Attributes:
         env_id: registered id.
@@ -64,7 +66,7 @@ def open_run(folder: Path, device: str = "cpu") -> Run:
     """Open a run by its folder.
 
     Args:
-        folder: with config.yaml and policy.pt or policy.zip.
+        folder: with config.yaml and policy.pt, policy.zip or, of an interrupted training, checkpoint.pt.
         device: torch's, where a policy of rsl_rl computes.
 
     Raises:
@@ -73,10 +75,24 @@ def open_run(folder: Path, device: str = "cpu") -> Run:
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}; give the one that a training has left, as in runs/")
     settings, kinds = folder / "config.yaml", {"policy.pt": _open_rsl, "policy.zip": _open_sb3}
-    found = [name for name in kinds if (folder / name).is_file()]
+    found = [folder / name for name in (*kinds, CHECKPOINT) if (folder / name).is_file()]
     if not settings.is_file() or not found:
-        raise ConfigError(f"{folder} must hold config.yaml and {' or '.join(kinds)}, as a training leaves them")
-    return kinds[found[0]](settings, folder / found[0], device)
+        raise ConfigError(
+            f"{folder} must hold config.yaml and {', '.join(kinds)} or {CHECKPOINT}, as a training leaves them"
+        )
+    # of a training that was resumed and interrupted, the checkpoint is the newer one
+    latest = max(found, key=lambda path: (path.stat().st_mtime, path.name != CHECKPOINT))
+    if latest.name == CHECKPOINT:
+        return _open_interrupted(settings, latest, device)
+    return kinds[latest.name](settings, latest, device)
+
+
+def _open_interrupted(settings: Path, checkpoint: Path, device: str) -> Run:
+    about = read_checkpoint(checkpoint)["about"]
+    kinds = {"rsl_rl.train": _open_rsl, "sb3.train": _open_sb3}
+    if about["script"] not in kinds:
+        raise ConfigError(f"{checkpoint} is of agents.{about['script']}, which trains several agents; this plays one")
+    return kinds[about["script"]](settings, checkpoint, device)
 
 
 def _open_rsl(settings: Path, policy: Path, device: str) -> Run:
@@ -109,7 +125,7 @@ def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
 
 @dataclass(frozen=True)
 class Options:
-    """Play the policy of a finished training."""
+    """Play the policy of a training, finished or interrupted."""
 
     #: folder of the run
     run: tyro.conf.Positional[Path]
@@ -209,10 +225,9 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
     check_port(options.port)
     import_viser()  # before the kernels are compiled, not after
     first = first_seed(run, options)
-    with suppress(KeyboardInterrupt):
-        made = EnvFactory(run.env_id, env, options.device)()
-        agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
-        watch_env(made, lambda seen: agent(seen[None, None])[0, 0], first, options.port, lambda: begin_round(agent, 1))
+    made = EnvFactory(run.env_id, env, options.device)()
+    agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
+    watch_env(made, lambda seen: agent(seen[None, None])[0, 0], first, options.port, lambda: begin_round(agent, 1))
 
 
 def score_run(agent: Agent, batch: EpisodeHost, first: int, options: Options, env: dict[str, Any]) -> None:

@@ -33,7 +33,6 @@ from agents.command import one_line_errors
 from agents.files import (
     RESULTS,
     check_figures,
-    check_writable,
     describe_run,
     plain,
     read_json,
@@ -41,6 +40,7 @@ from agents.files import (
     write_json,
 )
 from piavatar_envs.config import load_config
+from piavatar_envs.core.writing import check_writable
 from piavatar_envs.tasks import load_task
 
 #: Script of runs that are random actions of several streams.

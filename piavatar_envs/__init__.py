@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry
 
-from piavatar_envs.tasks import add_task, place_of, task_modules
+from piavatar_envs.tasks import add_task, id_of, place_of, task_modules
+from piavatar_envs.tasks.games import game_modules
 
 if TYPE_CHECKING:
     from piavatar_envs.api.conformance import check_task
@@ -55,6 +56,8 @@ __version__ = "0.1.0"
 
 #: Called by Gymnasium for every id.
 ENTRY_POINT = "piavatar_envs.api.gym_env:AvatarEnv"
+#: Called by Gymnasium for the id of a game, and raises an error that says where it is.
+GAME_ENTRY_POINT = "piavatar_envs.tasks.games:refuse_single"
 
 
 def _register(env_id: str, task: str) -> None:
@@ -101,3 +104,6 @@ def __dir__() -> list[str]:
 
 for _env_id in task_modules():
     _register(_env_id, _env_id)
+for _game, _file in game_modules().items():
+    # gym.make of a game says where it is, instead of that there is no such id
+    register(id=id_of(_file), entry_point=GAME_ENTRY_POINT, kwargs={"game": _game})

@@ -9,6 +9,7 @@ import ast
 import importlib
 import inspect
 import re
+import shlex
 import sys
 from collections.abc import Container
 from pathlib import Path
@@ -144,10 +145,10 @@ def registered_ids() -> list[str]:
     """Return the registered ids, sorted, with those of users' tasks; then the modules of several agents."""
     import gymnasium
 
-    from piavatar_envs import ENTRY_POINT  # importing the package registers the ids
+    from piavatar_envs import ENTRY_POINT, GAME_ENTRY_POINT  # importing the package registers the ids
     from piavatar_envs.multi import listed_games
 
-    found = gymnasium.registry.items()
+    found = [(name, spec) for name, spec in gymnasium.registry.items() if spec.entry_point != GAME_ENTRY_POINT]
     ids = [name for name, spec in found if spec.namespace == NAMESPACE or spec.entry_point == ENTRY_POINT]
     return [*sorted(ids), *listed_games()]
 
@@ -191,15 +192,28 @@ def hint_settings(args: list[str], options: Container[str]) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run a command; a user's mistake ends in one line and exit status 2."""
+    """Run a command; a user's mistake ends in one line and exit status 2, Ctrl-C in one line and 130."""
+    if (sys.argv[1:] if args is None else list(args)) == ["--version"]:
+        from piavatar_envs import __version__
+
+        print(f"piavatar-envs {__version__}")
+        return
     commands = {"list": list_command, "doctor": doctor_command, "play": play_command, "watch": watch_command}
     try:
         tyro.extras.subcommand_cli_from_dict(
-            commands, prog="piavatar-envs", description="Soft human avatars behind reset/step.", args=args
+            commands,
+            prog="piavatar-envs",
+            description="Soft human avatars behind reset/step. --version prints the version.",
+            args=args,
         )
     except (ValueError, ImportError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except KeyboardInterrupt as stop:
+        again = shlex.join(["python", "-m", "piavatar_envs", *(sys.argv[1:] if args is None else args)])
+        reached = str(stop) or "before the first step"
+        print(f"\ninterrupted {reached}; begin again with {again}", file=sys.stderr)
+        raise SystemExit(130) from None
     except SystemExit as stop:  # the parser has printed its complaint
         if stop.code == 2:
             given = sys.argv[1:] if args is None else args

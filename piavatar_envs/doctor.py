@@ -15,24 +15,11 @@ from typing import Any
 
 import gymnasium
 
-from piavatar_envs.core.extras import install_command
+from piavatar_envs.core.extras import EXTRAS, install_command
 from piavatar_envs.core.launch_graph import compiling_threads
+from piavatar_envs.tasks import NAMESPACE
 
 PACKAGES = ("piavatar-envs", "warp-lang", "numpy", "scipy", "gymnasium", "pydantic", "stable-baselines3", "torch")
-
-#: Modules by extra; an extra is present if all of its modules are.
-EXTRAS = {
-    "render": ("pyvista", "imageio", "imageio_ffmpeg", "PIL"),
-    "train": ("stable_baselines3", "torch", "matplotlib", "tensorboard"),
-    "motions": ("pybullet_data",),
-    "props": ("trimesh",),
-    "multi": ("pettingzoo",),
-    "skrl": ("skrl", "torch"),
-    "rsl": ("rsl_rl", "tensordict", "torch"),
-    "live": ("viser",),
-    "bench": ("mujoco",),
-    "dev": ("pytest", "xdist", "build"),
-}
 
 
 def examine() -> dict[str, Any]:
@@ -130,6 +117,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         ValueError: Warp has no such device.
     """
     wp = quiet_warp()
+    from piavatar_envs import ENTRY_POINT
     from piavatar_envs.core.kernel_cache import unusable
     from piavatar_envs.core.launch_graph import acquire
 
@@ -146,7 +134,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
     except OSError as error:
         raise unusable(error) from error
     for env_id, spec in sorted(gymnasium.registry.items()):
-        if environments and spec.namespace == "PIAvatar":
+        if environments and spec.namespace == NAMESPACE and spec.entry_point == ENTRY_POINT:
             env = gymnasium.make(env_id, device=device, fidelity="tiny")
             env.reset(seed=0)
             env.step(env.action_space.sample())
@@ -182,12 +170,11 @@ def show(report: dict[str, Any], *, as_json: bool = False) -> None:
 
 
 def quiet_warp() -> ModuleType:
-    """Return Warp, initialised without its banner, which would spoil the JSON on stdout."""
+    """Return Warp, initialised without its banner."""
     import warp as wp
 
     from piavatar_envs.core.kernel_cache import init_warp
 
-    wp.config.log_level = wp.LOG_WARNING
     init_warp()
     return wp
 

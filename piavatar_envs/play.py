@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
 from piavatar_envs.core.rng import check_seeds
+from piavatar_envs.core.writing import check_writable
 from piavatar_envs.mpm.types import failure_name
 from piavatar_envs.multi import load_game
 from piavatar_envs.render.video import check_suffix, write_video
@@ -32,12 +33,14 @@ class Rollout:
         returns: undiscounted return of each episode that began, in order; the last may be incomplete.
         failures: causes of the episodes that failed, in order.
         metrics: the numbers of the last step's ``info``, by dotted name.
+        interrupted: whether Ctrl-C ended it.
     """
 
     steps: int = 0
     returns: list[float] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     metrics: dict[str, float] = field(default_factory=dict)
+    interrupted: bool = False
 
 
 def play(
@@ -52,6 +55,8 @@ def play(
 ) -> Rollout:
     """Play ``env_id`` for some steps, beginning a new episode whenever one ends; without ``steps``, one episode.
 
+    Ctrl-C ends it early, with a video of what was played.
+
     Args:
         env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without its package.
         agent: "random" (uniform in the action space) or "zero".
@@ -63,13 +68,15 @@ def play(
         overrides: settings of the environment's configuration.
 
     Raises:
-        ValueError: an unknown module, agent or suffix, a number of steps below 1, a seed or a setting out of range.
+        ValueError: an unknown module, agent or suffix, a video that cannot be written, a number of steps below 1, a
+            seed or a setting out of range.
     """
     check_agent(agent, seed)
     if steps is not None and steps < 1:
         raise ValueError(f"steps={steps} must be >= 1")
-    if video is not None:
-        check_suffix(video)  # before the kernels are compiled
+    if video is not None:  # before the kernels are compiled
+        check_suffix(video)
+        check_writable(video)
     settings = settings_of(device, overrides)
     if video is not None:
         settings = {"render_mode": "rgb_array", "color": color, **settings}
@@ -168,23 +175,28 @@ def _frames(env: gymnasium.Env | JointEnv, agent: str, steps: int | None, seed: 
     still = np.zeros(env.action_space.shape, dtype=env.action_space.dtype)
     finished = True
     name = env.name if isinstance(env, JointEnv) else env.spec.id
-    with tqdm(total=steps, desc=name, unit="step", disable=None) as bar:
-        while steps is None or rollout.steps < steps:
-            if finished:
-                env.reset(seed=seed if rollout.steps == 0 else None)
-                rollout.returns.append(0.0)
+    try:
+        with tqdm(total=steps, desc=name, unit="step", disable=None) as bar:
+            while steps is None or rollout.steps < steps:
+                if finished:
+                    env.reset(seed=seed if rollout.steps == 0 else None)
+                    rollout.returns.append(0.0)
+                    yield env.render() if env.render_mode else None
+                _, reward, terminated, truncated, info = env.step(
+                    env.action_space.sample() if agent == "random" else still
+                )
+                rollout.steps += 1
+                rollout.returns[-1] += float(reward)
+                rollout.metrics = numbers(info)
+                if info.get("failure"):
+                    rollout.failures.append(failure_name(info["failure"]))
                 yield env.render() if env.render_mode else None
-            _, reward, terminated, truncated, info = env.step(env.action_space.sample() if agent == "random" else still)
-            rollout.steps += 1
-            rollout.returns[-1] += float(reward)
-            rollout.metrics = numbers(info)
-            if info.get("failure"):
-                rollout.failures.append(failure_name(info["failure"]))
-            yield env.render() if env.render_mode else None
-            bar.update()
-            finished = terminated or truncated
-            if finished and steps is None:
-                break
+                bar.update()
+                finished = terminated or truncated
+                if finished and steps is None:
+                    break
+    except KeyboardInterrupt:
+        rollout.interrupted = True
 
 
 def numbers(info: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
@@ -201,7 +213,14 @@ def numbers(info: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
 
 
 def show(rollout: Rollout, video: Path | None = None) -> None:
-    """Print a rollout's return and metrics."""
+    """Print a rollout's return and metrics; of an interrupted one, a line.
+
+    Raises:
+        KeyboardInterrupt: it was interrupted; what it has reached.
+    """
+    if rollout.interrupted:
+        kept = "" if video is None or not rollout.steps else f", filmed in {video}"
+        raise KeyboardInterrupt(f"after {rollout.steps} steps{kept}")
     from rich.console import Console
     from rich.table import Table
 

@@ -29,7 +29,7 @@ def watch(
     port: int = PORT,
     overrides: Mapping[str, Any] | None = None,
 ) -> None:
-    """Play ``env_id`` in a web browser until Ctrl-C.
+    """Play ``env_id`` in a web browser until Ctrl-C, then say how long it was.
 
     Args:
         env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without its package.
@@ -47,11 +47,10 @@ def watch(
     check_port(port)
     settings = settings_of(device, overrides)
     import_viser()  # before the kernels are compiled
-    with suppress(KeyboardInterrupt):
-        env = make(env_id, settings)
-        env.action_space.seed(seed)
-        still = np.zeros(env.action_space.shape, env.action_space.dtype)
-        watch_env(env, lambda _observation: env.action_space.sample() if agent == "random" else still, seed, port)
+    env = make(env_id, settings)
+    env.action_space.seed(seed)
+    still = np.zeros(env.action_space.shape, env.action_space.dtype)
+    watch_env(env, lambda _observation: env.action_space.sample() if agent == "random" else still, seed, port)
 
 
 def watch_env(
@@ -61,7 +60,7 @@ def watch_env(
     port: int = PORT,
     begin: Callable[[], None] = lambda: None,
 ) -> None:
-    """Play in a web browser until an exception ends it; then close the environment.
+    """Play in a web browser until Ctrl-C; then close the environment and say in a line how long it was.
 
     Args:
         env: made without a render mode.
@@ -72,17 +71,19 @@ def watch_env(
 
     Raises:
         ImportError: the extra ``live`` is not installed.
-        KeyboardInterrupt: Ctrl-C.
         ValueError: a port out of range.
     """
     try:
         inner = env.unwrapped
         live = Live(inner.batch, inner.apply_force, inner.config.render.color, port)
         try:
-            show = Show(env, act, begin, live)
-            show.begin(seed)
-            while True:
-                show.turn()
+            show = None
+            with suppress(KeyboardInterrupt):
+                show = Show(env, act, begin, live)
+                show.begin(seed)
+                while True:
+                    show.turn()
+            print(f"\nended after {show.played if show else 0} steps; the same command begins again")
         finally:
             live.close()
     finally:
@@ -94,6 +95,7 @@ class Show:
 
     Attributes:
         panel: the controls in the browser.
+        played: number of steps of all episodes.
     """
 
     def __init__(self, env: gymnasium.Env | JointEnv, act: Act, begin: Callable[[], None], live: Live) -> None:
@@ -102,7 +104,7 @@ class Show:
         self._env, self._act, self._begin, self._live = env, act, begin, live
         self._name = env.name if isinstance(env, JointEnv) else env.spec.id
         self._dt = env.unwrapped.config.physics.control_dt
-        self._over = False
+        self._over, self.played = False, 0
 
     def begin(self, seed: int | None = None) -> None:
         """Begin an episode: of ``seed``, or the next one."""
@@ -130,6 +132,7 @@ class Show:
         live.before_step()
         self._observation, reward, terminated, truncated, self._info = self._env.step(action)
         self._steps += 1
+        self.played += 1
         self._return += float(reward)
         self._over = terminated or truncated
         live.step(panel.speed)

@@ -11,8 +11,10 @@ import gymnasium
 import numpy as np
 import pytest
 
+import piavatar_envs
 from piavatar_envs import cli, doctor, play
 from piavatar_envs.mpm.types import FAILURE_CFL
+from piavatar_envs.render import write_video
 from piavatar_envs.tasks import task_modules
 
 PROBE = "PIAvatar/HouseProbe-v0"
@@ -68,6 +70,11 @@ def run(*args: str) -> str:
 
 def test_help_names_the_commands():
     assert all(word in run("--help") for word in ("list", "doctor", "play", "watch"))
+
+
+def test_version_is_printed(capsys):
+    cli.main(["--version"])
+    assert capsys.readouterr().out == f"piavatar-envs {piavatar_envs.__version__}\n"
 
 
 def test_list_shows_every_id_with_a_description(capsys):
@@ -139,6 +146,49 @@ def test_mistakes_end_in_one_line(probe, capsys, args, words):
         cli.main(args)
     error = capsys.readouterr().err
     assert stop.value.code == 2 and words in error.splitlines()[-1] and "Traceback" not in error
+
+
+@pytest.mark.parametrize("suffix", [".gif", None])
+def test_an_interrupted_play_ends_in_one_line_with_what_was_filmed(probe, capsys, tmp_path, monkeypatch, suffix):
+    step = Probe.step
+
+    def interrupted(self, action):
+        if self.t == 2:
+            raise KeyboardInterrupt
+        return step(self, action)
+
+    monkeypatch.setattr(Probe, "step", interrupted)
+    video = tmp_path / "new" / f"film{suffix}"
+    options = ["--video", str(video)] if suffix else []
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["play", PROBE, "--steps", "9", *options])
+    assert stop.value.code == 130
+    said = capsys.readouterr()
+    assert said.out == "" and len(said.err.strip().splitlines()) == 1
+    assert (
+        f"interrupted after 2 steps{f', filmed in {video}' if suffix else ''}; begin again with python -m" in said.err
+    )
+    assert video.exists() == bool(suffix)
+
+
+@pytest.mark.parametrize("place", ["file/x.mp4", "file/deep/x.gif", "folder.mp4", "/proc/nowhere/x.mp4"])
+def test_a_video_that_cannot_be_written_is_refused_and_nothing_is_created(probe, capsys, tmp_path, place):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.mp4").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["play", PROBE, "--video", str(tmp_path / place)])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and error.count("\n") == 1 and place in error
+    assert sorted(tmp_path.rglob("*")) == before and probe == []
+
+
+def test_a_video_that_fails_leaves_no_folder(tmp_path, monkeypatch):
+    for suffix, module in ((".mp4", "imageio_ffmpeg"), (".gif", "PIL")):
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(ImportError, match=r"\[render\]"):
+            write_video(tmp_path / "new" / f"x{suffix}", [np.zeros((16, 16, 3), np.uint8)], 30.0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_play_prints_the_return(probe, capsys):

@@ -8,9 +8,11 @@ import gymnasium
 import numpy as np
 import pytest
 
+from piavatar_envs import ENTRY_POINT
 from piavatar_envs.api.pictures import SceneReader
 from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED
 from piavatar_envs.tasks import NAMESPACE, task_modules
+from piavatar_envs.tasks.games import game_modules
 from tests.conftest import SAMPLE, reward_terms
 
 #: The one complaint of Gymnasium's checker that is wanted: these observations have no honest limits.
@@ -38,8 +40,22 @@ def rollout(env, steps: int, seed: int | None = None, actions: int = 0, episodes
     return log
 
 
+def piavatar_specs() -> list[tuple[str, gymnasium.envs.registration.EnvSpec]]:
+    return [(env_id, spec) for env_id, spec in gymnasium.registry.items() if spec.namespace == NAMESPACE]
+
+
+def test_gym_make_of_a_game_names_its_module():
+    """A game has no single agent; its id in Gymnasium's style says where it is, instead of that there is none."""
+    games = [(env_id, spec) for env_id, spec in piavatar_specs() if spec.entry_point != ENTRY_POINT]
+    assert len(games) == len(game_modules()) and "PIAvatar/PassBall-v0" in dict(games)
+    for make in (gymnasium.make, gymnasium.make_vec):
+        for env_id, spec in games:
+            with pytest.raises(ValueError, match=rf"piavatar_envs\.multi import {spec.kwargs['game']}; .*parallel_env"):
+                make(env_id)
+
+
 def test_every_task_file_is_registered():
-    registered = {env_id for env_id, spec in gymnasium.registry.items() if spec.namespace == NAMESPACE}
+    registered = {env_id for env_id, spec in piavatar_specs() if spec.entry_point == ENTRY_POINT}
     assert registered == set(task_modules()) >= {"PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"}
     # a TimeLimit wrapper would escape get_state
     assert all(gymnasium.spec(env_id).max_episode_steps is None for env_id in registered)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -154,7 +155,8 @@ def test_ctrl_c_ends_it_without_a_traceback(device):
     try:
         assert "live view: http://127.0.0.1:" in run.stdout.readline()
         run.send_signal(signal.SIGINT)
-        _, error = run.communicate(timeout=60)
+        said, error = run.communicate(timeout=60)
     finally:
         run.kill()
     assert run.returncode == 0 and "Traceback" not in error, error
+    assert re.search(r"ended after \d+ steps; the same command begins again", said)

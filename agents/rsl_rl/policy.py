@@ -13,9 +13,10 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from agents.batch_training import BatchTraining, load_batched
-from agents.checkpoint import load_weights, policy_mismatch
+from agents.checkpoint import load_weights, policy_mismatch, read_checkpoint
 from agents.config import Widths
 from agents.evaluate import Agent
+from agents.files import CHECKPOINT
 from agents.rsl_rl.curriculum import AssistSchedule
 from agents.sb3.workers import components
 from piavatar_envs.config import FROZEN, FrozenDict
@@ -103,7 +104,7 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     """Load the agent of an earlier training.
 
     Args:
-        path: of its ``policy.pt``; nothing in it is unpickled.
+        path: of its ``policy.pt``, or of the checkpoint of one that was interrupted; nothing in it is unpickled.
         config: resolved.
         layout: of the observation.
         action_size: length of an action.
@@ -118,7 +119,12 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     shown = TensorDict({"policy": torch.zeros(1, len(seen))}, [1])
     actor = network(shown, {"actor": ["policy"]}, "actor", action_size, **settings).to(device)
     try:
-        actor.load_state_dict(load_weights(path, device))
+        interrupted = path.name == CHECKPOINT
+        actor.load_state_dict(
+            read_checkpoint(path)["state"]["algorithm"]["actor_state_dict"]
+            if interrupted
+            else load_weights(path, device)
+        )
     except UNREADABLE as error:
         raise policy_mismatch(path, len(seen), action_size, error) from None
     return mean_agent(actor.eval(), seen, device)

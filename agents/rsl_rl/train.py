@@ -85,7 +85,7 @@ class Runner(OnPolicyRunner):
             }
         }
         super().__init__(env, settings, log_dir=str(folder / "rsl_rl"), device=str(env.device))
-        self.alg.check, self._config = self._check_finite, config
+        self.alg.check, self._config = self._check_update, config
         self.logger.git_status_repos.clear()  # results.json has the commit; no diffs of other repositories
         if saved:
             self._restore(saved)
@@ -95,11 +95,13 @@ class Runner(OnPolicyRunner):
 
         Raises:
             ConfigError: there have been more already.
+            KeyboardInterrupt: Ctrl-C, after a checkpoint was written.
         """
         left = iterations - iterations_of(self.checkpoint, iterations)
         if left:
             self.current_learning_iteration = self.iterations
-            self.learn(left, init_at_random_ep_len=self.iterations == 0)
+            with self.checkpoint.stop.listening():
+                self.learn(left, init_at_random_ep_len=self.iterations == 0)
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save the networks and the checkpoint; rsl_rl calls it between iterations."""
@@ -107,6 +109,17 @@ class Runner(OnPolicyRunner):
         self.iterations, self.curve = self.current_learning_iteration + 1, self.logger.writer.curve
         self.curve.seconds = time.monotonic() - self._begun
         self.checkpoint.save(self._state())
+        self.checkpoint.stop.obey(self.checkpoint.reached)
+
+    def _check_update(self) -> None:
+        """Let an iteration that Ctrl-C has made the last one be saved, if the networks are finite.
+
+        Raises:
+            Diverged: they are not.
+        """
+        if self.checkpoint.stop.made:
+            self.cfg["save_interval"] = 1
+        self._check_finite()
 
     def _check_finite(self) -> None:
         """Raise an error if networks have diverged, before anything is saved.

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -36,6 +37,9 @@ from agents.sb3.ppo import MarkPlayed
 from agents.sb3.workers import EnvFacts, components
 from piavatar_envs.api.sb3 import SB3VecEnv
 from piavatar_envs.config import ConfigError
+
+#: Returns the end of a training by ``time.monotonic()``, given the steps and the seconds [s] that it has had.
+Deadline = Callable[[int, float], float]
 
 
 class Events(TensorBoardOutputFormat):
@@ -69,14 +73,14 @@ class ScaledMonitor(VecMonitor):
 class Progress(BaseCallback):
     """Callback that logs the episodes, shows a bar, and ends the training at its deadline."""
 
-    def __init__(self, curve: Curve, total_steps: int, start: float, deadline: float | None) -> None:
+    def __init__(self, curve: Curve, total_steps: int, start: float, deadline: Deadline | None) -> None:
         """Configure the callback.
 
         Args:
             curve: where to book.
             total_steps: at which the bar is full.
             start: of the training by ``time.monotonic()``, earlier parts of a resumed one included.
-            deadline: by ``time.monotonic()``, or None.
+            deadline: of the training, or None.
         """
         super().__init__()
         self.bar: tqdm | None = None
@@ -97,7 +101,7 @@ class Progress(BaseCallback):
                 self.bar.set_postfix({"return": f"{np.mean(self.curve.returns[-20:]):.1f}"}, refresh=False)
         self.bar.update(self.num_timesteps - self.bar.n)
         self.curve.seconds = time.monotonic() - self.start
-        return self.deadline is None or time.monotonic() < self.deadline
+        return self.deadline is None or time.monotonic() < self.deadline(self.num_timesteps, self.curve.seconds)
 
     def _on_training_end(self) -> None:
         self.close()
@@ -133,7 +137,7 @@ def learn(
     model: BaseAlgorithm,
     folder: Path,
     checkpoint: Checkpoint | None = None,
-    deadline: float | None = None,
+    deadline: Deadline | None = None,
     watchers: Sequence[BaseCallback] = (),
 ) -> Curve:
     """Train until the steps or the time are over.
@@ -145,11 +149,12 @@ def learn(
         model: from :func:`begin`, with the same checkpoint.
         folder: where to write; exists.
         checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
-        deadline: by ``time.monotonic()``, or None.
+        deadline: when to end before all steps, or None.
         watchers: what else to call at every step, before the checkpoint is written.
 
     Raises:
         Diverged: the networks are not finite any more.
+        KeyboardInterrupt: Ctrl-C, after a checkpoint was written.
     """
     write_config(folder, config)
     curve = Curve()
@@ -165,8 +170,11 @@ def learn(
     watch += [snapshots, *watchers, progress]
     if checkpoint is not None:
         watch.append(KeepCheckpoint(checkpoint, config.checkpoint_every, curve, check))
+    listening = nullcontext() if checkpoint is None else checkpoint.stop.listening()
     try:
-        model.learn(config.total_steps - model.num_timesteps, callback=CallbackList(watch), reset_num_timesteps=False)
+        with listening:
+            left = config.total_steps - model.num_timesteps
+            model.learn(left, callback=CallbackList(watch), reset_num_timesteps=False)
     except ValueError:  # torch's message about broken networks does not name the cause
         check()
         raise
@@ -177,6 +185,8 @@ def learn(
     model.logger.close()
     write_atomically(folder / "policy.zip", model.save)
     curve.save(folder / "curve.csv")
+    if checkpoint is not None:
+        checkpoint.stop.obey(checkpoint.reached)
     return curve
 
 
@@ -339,8 +349,10 @@ class KeepCheckpoint(BaseCallback):
         self._kept = self.model.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps - self._kept >= self.every:
+        stop = self.checkpoint.stop
+        if self.model.num_timesteps - self._kept >= self.every or stop.made:
             self._keep()
+        stop.obey(self.checkpoint.reached)
         self._in_rollout = True
 
     def _on_rollout_end(self) -> None:

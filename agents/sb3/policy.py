@@ -12,8 +12,9 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.sac.policies import SACPolicy
 
-from agents.checkpoint import policy_mismatch
+from agents.checkpoint import policy_mismatch, read_checkpoint
 from agents.evaluate import Agent
+from agents.files import CHECKPOINT
 from agents.sb3 import ppo
 from agents.sb3.config import TrainingConfig
 from agents.sb3.workers import components
@@ -38,7 +39,7 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
     stable-baselines3's own ``load`` would.
 
     Args:
-        path: of its ``policy.zip``.
+        path: of its ``policy.zip``, or of the checkpoint of one that was interrupted.
         config: resolved, of one agent.
         layout: of the observation.
         action_size: length of an action.
@@ -48,14 +49,21 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
     """
     policy = _untrained(config, layout, action_size)
     try:
-        with zipfile.ZipFile(path) as content, content.open(PARAMETERS) as file:
-            loaded = policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True), strict=False)
+        loaded = policy.load_state_dict(_parameters(path), strict=False)
         unlike = [name for name in loaded.missing_keys if not name.startswith(CRITICS)] + loaded.unexpected_keys
         if unlike:
             raise KeyError(f"missing or unknown parameters: {', '.join(unlike)}")
     except UNREADABLE as error:
         raise policy_mismatch(path, len(components(layout, config.observe)), action_size, error) from None
     return policy_agent(policy.eval())
+
+
+def _parameters(path: Path) -> dict[str, torch.Tensor]:
+    """Read the parameters of a policy."""
+    if path.name == CHECKPOINT:
+        return read_checkpoint(path)["state"]["modules"]["policy"]
+    with zipfile.ZipFile(path) as content, content.open(PARAMETERS) as file:
+        return torch.load(file, map_location="cpu", weights_only=True)
 
 
 def _untrained(config: TrainingConfig, layout: ObservationLayout, action_size: int) -> BasePolicy:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
@@ -21,10 +22,11 @@ from agents.checkpoint import Checkpoint, Diverged
 from agents.command import read_options, script_hint
 from agents.evaluate import Evaluation, baselines, evaluate
 from agents.files import made
+from agents.interrupt import command, ended_by_interrupt
 from agents.report import Curve, conclude, draw_curve, versions
 from agents.sb3 import matches, selfplay
 from agents.sb3.config import TrainingConfig, load_training
-from agents.sb3.learning import begin, learn
+from agents.sb3.learning import Deadline, begin, learn
 from agents.sb3.parallel import AgentVecEnv
 from agents.sb3.policy import policy_agent
 from agents.sb3.workers import EnvFacts, components, factory, prepare, start
@@ -41,7 +43,7 @@ def train(
     facts: EnvFacts,
     folder: Path,
     checkpoint: Checkpoint | None = None,
-    deadline: float | None = None,
+    deadline: Deadline | None = None,
 ) -> tuple[BaseAlgorithm, Curve]:
     """Train until the steps or the time are over; leaves policies and the curve in ``folder``.
 
@@ -51,7 +53,7 @@ def train(
         facts: of their environment.
         folder: where to write; exists.
         checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
-        deadline: by ``time.monotonic()``, or None.
+        deadline: when to end before all steps, or None.
 
     Raises:
         ConfigError: the checkpoint has more steps than the configuration sets.
@@ -111,7 +113,7 @@ class Options:
     resume: bool = False
 
 
-def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None:
+def run(config: TrainingConfig, folder: Path, device: str, resume: bool, again: str) -> None:
     """Train, or resume a training, and evaluate.
 
     Args:
@@ -119,12 +121,14 @@ def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None
         folder: where to write; nothing in it changes before all that can be refused has been.
         device: where to simulate.
         resume: whether to go on from the folder's checkpoint.
+        again: command line that resumes this training.
 
     Raises:
         ConfigError: the folder is another training's, the checkpoint does not fit, or the configuration does not fit
             the environment or the device.
         Diverged: the networks are not finite any more.
         OSError: something cannot be written.
+        SystemExit: Ctrl-C, in one line.
     """
     learns = train_selfplay if config.selfplay else train_cooperative if config.is_multi else train_single
     with made(folder):
@@ -137,7 +141,8 @@ def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None
         except ValueError as error:
             raise ConfigError(str(error)) from error
         try:
-            curve, results = learns(config, workers, facts, folder, checkpoint)
+            with ended_by_interrupt(partial(checkpoint.remedy, again)):
+                curve, results = learns(config, workers, facts, folder, checkpoint)
         finally:
             workers.close()
     bands = {result.agent: result.estimate() for result in results if isinstance(result, Evaluation)}
@@ -158,8 +163,10 @@ def main(args: list[str] | None = None) -> None:
         check_device(options.device)
     except ValueError as error:
         sys.exit(f"error: {error}{script_hint(options.config, 'sb3.train')}")
+    again = command("sb3.train", args, "--resume")
     try:
-        run(config, options.out or Path("runs") / options.config.stem, options.device, options.resume)
+        with ended_by_interrupt(lambda: f"before the training; begin again with {again}"):
+            run(config, options.out or Path("runs") / options.config.stem, options.device, options.resume, again)
     except (ConfigError, Diverged, OSError) as error:
         sys.exit(f"error: {error}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,13 +94,26 @@ def start(config: TrainingConfig, make: EnvFactory | WorldFactory, device: str =
     return start_vector(config, device) if config.vector else start_workers(make, config.num_workers)
 
 
+@dataclass(frozen=True)
+class InWorker:
+    """Factory of an environment in a process of its own."""
+
+    make: EnvFactory | WorldFactory
+
+    def __call__(self) -> gym.Env:
+        """Build the environment, and leave Ctrl-C, which reaches all processes of a terminal, to the parent."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return self.make()
+
+
 def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
     """Start ``num_workers`` environments; a single one stays in this process."""
     torch.set_num_threads(1)  # the workers have the cores; the networks are small
     if num_workers == 1:
         return DummyVecEnv([make])
     methods = multiprocessing.get_all_start_methods()  # never fork: a copy of a running Warp is not a working one
-    return SubprocVecEnv([make] * num_workers, start_method="forkserver" if "forkserver" in methods else "spawn")
+    method = "forkserver" if "forkserver" in methods else "spawn"
+    return SubprocVecEnv([InWorker(make)] * num_workers, start_method=method)
 
 
 def start_vector(config: TrainingConfig, device: str = "cpu") -> VecEnv:

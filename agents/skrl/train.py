@@ -120,15 +120,19 @@ class WorldMAPPO(MAPPO):
 
         Raises:
             Diverged: the networks are not finite any more.
+            KeyboardInterrupt: Ctrl-C, after a checkpoint was written.
         """
         super().post_interaction(timestep=self._first_step + timestep, timesteps=timesteps)
         if self._rollout % self.cfg.rollouts == 0:
             self.iterations += 1
             self._check_finite()
             self.curve.seconds = time.monotonic() - self._begun
-            due = self.iterations % self.checkpoint_every == 0 or timestep + 1 == timesteps
-            if self.checkpoint is not None and due:
+            if self.checkpoint is None:
+                return
+            ends = timestep + 1 == timesteps or self.checkpoint.stop.made
+            if ends or self.iterations % self.checkpoint_every == 0:
                 self.checkpoint.save(self._state())
+            self.checkpoint.stop.obey(self.checkpoint.reached)
 
     def _check_finite(self) -> None:
         networks = {f"{name} {part}": network for name, own in self.models.items() for part, network in own.items()}
@@ -203,7 +207,8 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
     )
     write_config(folder, config)
     mappo.resume()
-    trainer.train()
+    with checkpoint.stop.listening():
+        trainer.train()
     mappo.curve.train_steps = config.iterations * config.num_envs * config.mappo.rollout_steps
     write_atomically(folder / "policy.pt", mappo.save)
     env.close()

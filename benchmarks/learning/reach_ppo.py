@@ -47,7 +47,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
     facts = prepare(make)
     venv = start_workers(make, config.num_workers)
     try:
-        references = [evaluation for evaluation, _ in play_references(config, venv, facts)]
+        references = play_references(config, venv, facts)
         yield from (evaluation.row() for evaluation in references)
         returns = []
         for seed in range(options.seeds):

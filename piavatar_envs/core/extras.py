@@ -6,6 +6,19 @@ import importlib.metadata
 import json
 from pathlib import Path
 
+#: Modules by extra; an extra is present if all of its modules are.
+EXTRAS = {
+    "render": ("pyvista", "imageio", "imageio_ffmpeg", "PIL"),
+    "train": ("stable_baselines3", "torch", "matplotlib", "tensorboard"),
+    "motions": ("pybullet_data",),
+    "props": ("trimesh",),
+    "multi": ("pettingzoo",),
+    "skrl": ("skrl", "torch"),
+    "rsl": ("rsl_rl", "tensordict", "torch"),
+    "live": ("viser",),
+    "bench": ("mujoco",),
+    "dev": ("pytest", "xdist", "build"),
+}
 #: The folder that holds the package: the root of a checkout, or a folder of installed packages.
 _ROOT = Path(__file__).resolve().parents[2]
 
@@ -25,6 +38,16 @@ def install_command(extra: str) -> str:
     return f'pip install "piavatar-envs[{extra}]{source}"'
 
 
-def missing(what: str, package: str, extra: str) -> ImportError:
+def extras_of(module: str, *more: str) -> str:
+    """Return the extras that install a module, and ``more`` ones, as an argument of :func:`install_command`."""
+    first = next((extra for extra, modules in EXTRAS.items() if module in modules), "train")
+    return ",".join(dict.fromkeys((first, *more)))
+
+
+class MissingExtra(ImportError):
+    """A package of an extra is not installed; one line with the command that installs it."""
+
+
+def missing(what: str, package: str, extra: str) -> MissingExtra:
     """Return the error of ``what`` needing ``package``, which is not installed, with the command that installs it."""
-    return ImportError(f"{what} needs {package}, which is not installed; install it with: {install_command(extra)}")
+    return MissingExtra(f"{what} needs {package}, which is not installed; install it with: {install_command(extra)}")

@@ -31,7 +31,7 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> P
     share one palette of 128 colours: meant for short clips.
 
     Args:
-        path: the file; its suffix, ``.mp4`` or ``.gif``, says how. Missing folders are made.
+        path: the file; its suffix, ``.mp4`` or ``.gif``, says how. Missing folders are made once there is a picture.
         frames: pictures of one size, shape ``(H, W, 3)`` uint8.
         fps: frames per second, in a GIF 50 at most. A GIF counts hundredths of a second: its frames take turns to be
             longer and shorter, so that each begins within 10 ms of its time.
@@ -48,7 +48,6 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> P
     check_suffix(path)
     if not fps > 0.0:
         raise ValueError(f"fps={fps} must be positive")
-    path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix.lower() == ".mp4":
         count = _write_mp4(path, frames, fps)
     else:
@@ -70,6 +69,7 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
             if writer is None:
                 shape = frame.shape
                 even = _even(frame)
+                path.parent.mkdir(parents=True, exist_ok=True)
                 # H.264 with 4:2:0 colour plays everywhere, and needs even sides.
                 writer = imageio_ffmpeg.write_frames(
                     str(path), (even.shape[1], even.shape[0]), fps=fps, codec="libx264", pix_fmt_out="yuv420p",
@@ -102,6 +102,7 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
         palette = strip.quantize(_GIF_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
         durations = _gif_durations(len(images), fps)
+        path.parent.mkdir(parents=True, exist_ok=True)
         images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)
     return len(images)
 

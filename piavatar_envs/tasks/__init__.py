@@ -22,7 +22,12 @@ _VERSION = re.compile(r"[-_]v\d+$")
 def task_modules() -> dict[str, str]:
     """Return registered ids -> module names: ``PIAvatar/TrackMotion-v0`` for ``track_motion``. Imports nothing."""
     names = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.ispkg)
-    return {f"{NAMESPACE}/{''.join(part.capitalize() for part in name.split('_'))}-v0": name for name in names}
+    return {id_of(name): name for name in names}
+
+
+def id_of(module: str) -> str:
+    """Return the id of a file's task: ``PIAvatar/TrackMotion-v0`` for ``track_motion``."""
+    return f"{NAMESPACE}/{''.join(part.capitalize() for part in module.split('_'))}-v0"
 
 
 #: Tasks from elsewhere by id, see :func:`add_task`.

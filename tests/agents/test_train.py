@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from agents.sb3.config import load_training
 from agents.sb3.policy import policy_agent
 from agents.sb3.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.config import dump_yaml
+from tests.agents.conftest import TINY
 
 SB3 = Path(__file__).resolve().parents[2] / "configs" / "sb3"
 PUBLISHED = sorted(path for path in SB3.glob("*.yaml") if "vector: true" in path.read_text(encoding="utf-8"))
@@ -107,7 +109,8 @@ def test_published_vectors_train_and_leave_their_results(path, device, tmp_path)
 
 def test_a_deadline_ends_the_training_with_a_policy(tiny, workers, facts, tmp_path):
     endless = tiny.model_copy(update={"total_steps": 10_000_000})
-    model, _ = train.train(endless, workers, facts, tmp_path, deadline=time.monotonic() + 1.0)
+    begun = time.monotonic()
+    model, _ = train.train(endless, workers, facts, tmp_path, deadline=lambda steps, _: begun + 1.0)
     assert model.num_timesteps < 10_000_000
     assert (tmp_path / "policy.zip").is_file()
     assert np.isfinite(evaluate("x", policy_agent(model), workers, 2, 0, progress=False).returns).all()
@@ -157,7 +160,14 @@ def test_the_demo_replaces_a_stopped_one_and_leaves_policy_film_and_scores(tmp_p
         assert not any((tmp_path / name).exists() for name in demo.LATER)
         return trained(*args, **kwargs)
 
+    played = demo.play_references
+
+    def compared(*args):
+        assert (tmp_path / "policy.zip").is_file(), "it trains first"
+        return played(*args)
+
     monkeypatch.setattr(demo, "train", watched)
+    monkeypatch.setattr(demo, "play_references", compared)
     outcome = demo.run(options, Console(quiet=True))
     assert len({tuple(e.seed for e in evaluation.episodes) for evaluation in outcome.evaluations}) == 1
     for name in ("policy.zip", "curve.png", "before_after.mp4", "config.yaml"):
@@ -165,6 +175,32 @@ def test_the_demo_replaces_a_stopped_one_and_leaves_policy_film_and_scores(tmp_p
     results = json.loads((tmp_path / "results.json").read_text())
     assert [row["case"] for row in results["results"]] == ["zero", "random", "scripted IK", "trained"]
     assert load_training(tmp_path / "config.yaml").seed == 4
+
+
+def test_a_demo_on_a_slow_machine_trains_for_half_of_the_time_and_fails_if_nothing_was_learned(
+    tmp_path, monkeypatch, capsys
+):
+    class Trained(Exception):
+        pass
+
+    def train(*args, deadline):
+        left = deadline(4, 100.0) - time.monotonic()  # at 25 s a step nothing else would fit
+        assert 0.4 * 570.0 < left <= 0.5 * 570.0
+        raise Trained
+
+    options = ["env.fidelity=tiny", "num_workers=1", "--out", str(tmp_path)]
+    with monkeypatch.context() as patch, pytest.raises(Trained):
+        patch.setattr(demo, "train", train)
+        demo.main(options)
+    workers = start_workers(factory(load_training(TINY)), 1)
+    size = workers.action_space.shape[0]
+    rows = evaluate("zero", zero_agent(size), workers, 2, 0, progress=False)
+    outcome = demo.Outcome((rows,) * 4, 4, 1.0, 4.0, 4.0, separated=False)
+    monkeypatch.setattr(demo, "run", lambda *_: outcome)
+    with pytest.raises(SystemExit, match="error: nothing was learned in 4 steps"):
+        demo.main(options)
+    monkeypatch.setattr(demo, "run", lambda *_: replace(outcome, separated=True))
+    demo.main(options)
 
 
 def test_inverse_kinematics_reaches_every_target(device):

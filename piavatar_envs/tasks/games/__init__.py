@@ -9,7 +9,7 @@ import importlib
 import pkgutil
 import re
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from piavatar_envs.tasks import check_task_class, instead_of, load_task
 
@@ -28,6 +28,18 @@ def game_modules() -> dict[str, str]:
 def listed_games() -> tuple[str, ...]:
     """Return the names of all games, those of this package first. Imports nothing."""
     return (*game_modules(), *_added)
+
+
+def refuse_single(game: str, **settings: Any) -> NoReturn:
+    """Refuse to make a game with Gymnasium, which has one agent.
+
+    Raises:
+        ValueError: always, with the way to make it.
+    """
+    raise ValueError(
+        f"{game} is a game of several agents, which gym.make cannot make; use PettingZoo's interface: "
+        f"from piavatar_envs.multi import {game}; {game}.parallel_env()"
+    )
 
 
 def register_game(name: str, task: type[Task] | str) -> None:

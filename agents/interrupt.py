@@ -1,0 +1,90 @@
+"""Ctrl-C in trainings: the first one ends a training where it can go on later, the second one at once."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+_NOTICE = b"\nending where the training can go on later, after this rollout; Ctrl-C again ends it at once\n"
+
+
+class StopRequest:
+    """Request to end a training, made by Ctrl-C while :meth:`listening`.
+
+    Attributes:
+        made: whether there was one.
+        reached: what the training had had when it ended.
+    """
+
+    def __init__(self) -> None:
+        self.made, self.reached = False, ""
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take Ctrl-C as the request for the duration; the second one raises KeyboardInterrupt.
+
+        Signals reach the main thread only: in other threads this does nothing.
+        """
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def request(number: int, frame: Any) -> None:
+            if self.made:
+                signal.default_int_handler(number, frame)
+            self.made = True
+            os.write(2, _NOTICE)  # a signal may interrupt a print, which cannot be entered again
+
+        before = signal.signal(signal.SIGINT, request)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    def obey(self, reached: str) -> None:
+        """End the training if there was a request; call it where nothing is lost.
+
+        Args:
+            reached: what the training has had.
+
+        Raises:
+            KeyboardInterrupt: there was one.
+        """
+        if self.made:
+            self.reached = reached
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def ended_by_interrupt(remedy: Callable[[], str]) -> Iterator[None]:
+    """End the script by Ctrl-C with one line and exit status 130, instead of a traceback.
+
+    Args:
+        remedy: returns the rest of the line: what was reached, and how to go on.
+
+    Raises:
+        SystemExit: Ctrl-C.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"\ninterrupted {remedy()}", file=sys.stderr)  # a bar may have the line before
+        raise SystemExit(128 + signal.SIGINT) from None
+
+
+def command(script: str, args: Sequence[str] | None, *more: str) -> str:
+    """Return the command line of a script as it was given, with options that it lacks.
+
+    Args:
+        script: its name, without ``agents.``.
+        args: as given to its ``main``: None for the process's own.
+        *more: options to add.
+    """
+    given = list(sys.argv[1:] if args is None else args)
+    return shlex.join(["python", "-m", f"agents.{script}", *given, *(option for option in more if option not in given)])
