@@ -60,7 +60,7 @@ class AvatarEnv(SingleView, gym.Env):
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
-            ImportError: ``render_mode="human"`` without the extra ``live``.
+            ImportError: a render mode without its extra: ``render`` or, for ``"human"``, ``live``.
             ValueError: an unknown task or one that the id is not registered for, an unknown render mode or device, or
                 less than one control step.
         """

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 
 from piavatar_envs.api.arrays import Array, find_array_api
-from piavatar_envs.api.pictures import Live, Pictures
+from piavatar_envs.api.pictures import Live, Pictures, check_extra
 from piavatar_envs.api.readings import find_reading
 from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.config import ConfigError, EnvConfig
@@ -34,6 +34,8 @@ from piavatar_envs.sim.world import check_device
 Settings = EnvConfig | Mapping[str, Any] | str | Path | None
 #: Substeps a control step above which an environment is worth a warning: several times those of the finest bodies.
 MANY_SUBSTEPS = 300
+#: Time of a particle's substep on a CPU core, of default bodies [s]; see docs/performance.md.
+SUBSTEP_TIME = 2.5e-7
 Limited = TypeVar("Limited", bound=EnvConfig)
 
 
@@ -55,6 +57,7 @@ class EpisodeHost:
         layout, action_size, action_names: of an agent's flat observation and of its action.
         device: name of the Warp device.
         ready: whether there has been a reset.
+        closed: whether :meth:`close` was called, after which nothing is played.
         pictures: draws single environments.
         live: the live view of the only environment, or None.
     """
@@ -80,9 +83,10 @@ class EpisodeHost:
 
         Raises:
             ConfigError: settings that contradict each other.
-            ImportError: ``array_api="torch"`` without torch, or ``render_mode="human"`` without the extra ``live``.
+            ImportError: ``array_api="torch"`` without torch, or a render mode without its extra: ``render``, ``live``.
             ValueError: no environments or threads, an unknown device or kind of arrays.
         """
+        check_extra(render_mode)
         check_count("num_envs", num_envs)
         if num_threads is not None:
             check_count("num_threads", num_threads, ", or None for one a core")
@@ -101,19 +105,21 @@ class EpisodeHost:
         self.num_agents, self.layout, self.action_size = first.num_agents, first.layout, first.action_spec.size
         self.action_names: tuple[str, ...] = tuple(first.action_spec.names())
         self._warn_of_many_substeps(first)
-        self.ready, self.render_mode = False, render_mode
+        self.ready, self.closed, self.render_mode = False, False, render_mode
         self.pictures = Pictures(self.group_of, self.config.render)
         self.live = Live(first, self.apply_force, self.config.render.color) if render_mode == "human" else None
 
     @staticmethod
     def _warn_of_many_substeps(batch: BatchEnv) -> None:
         """Warn of a control step that is slow because matter is stiff or fast, or the resolution fine."""
-        count, physics = batch.simulation.model.num_substeps, batch.config.physics
+        model, physics = batch.simulation.model, batch.config.physics
+        count = model.num_substeps
         if count > MANY_SUBSTEPS:
+            seconds = SUBSTEP_TIME * count * model.num_particles
             gym.logger.warn(
-                f"a control step takes {count} substeps with physics.young_modulus={physics.young_modulus:g} Pa and "
-                f"fidelity={physics.fidelity!r}, and time in proportion; softer or slower matter, or a coarser "
-                "fidelity, needs fewer"
+                f"a control step takes {count} substeps, about {seconds:.1g} s on a free CPU core, with "
+                f"physics.young_modulus={physics.young_modulus:g} Pa and fidelity={physics.fidelity!r}; softer or "
+                "slower matter, or a coarser fidelity, needs fewer"
             )
 
     @property
@@ -153,7 +159,9 @@ class EpisodeHost:
             ValueError: a mask or seeds of the wrong shape, or a seed outside [0, 2^32); nothing has changed then.
             gymnasium.error.Error: a seed that is not a whole number.
             gymnasium.error.ResetNeeded: the first reset is not of all environments.
+            gymnasium.error.ClosedEnvironmentError: after :meth:`close`.
         """
+        self.check_open("reset")
         mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(f"the mask has shape {mask.shape} and type {mask.dtype}; use ({self.num_envs},) bool")
@@ -189,12 +197,23 @@ class EpisodeHost:
             seeds = [int(own) if seed is None else seed for seed, own in zip(seeds, drawn, strict=True)]
         return seeds
 
-    def check_ready(self, call: str) -> None:
-        """Refuse ``call`` before the first reset.
+    def check_open(self, call: str) -> None:
+        """Refuse ``call`` after :meth:`close`.
 
         Raises:
-            gymnasium.error.ResetNeeded: there was none.
+            gymnasium.error.ClosedEnvironmentError: the environments were closed.
         """
+        if self.closed:
+            raise gym.error.ClosedEnvironmentError(f"{call}() after close(): make a new environment")
+
+    def check_ready(self, call: str) -> None:
+        """Refuse ``call`` before the first reset, and after the environments were closed.
+
+        Raises:
+            gymnasium.error.ClosedEnvironmentError: they were.
+            gymnasium.error.ResetNeeded: there was no reset.
+        """
+        self.check_open(call)
         if not self.ready:
             raise gym.error.ResetNeeded(f"call reset() before {call}()")
 
@@ -369,6 +388,7 @@ class EpisodeHost:
             ValueError: the state is of another environment, another number or other settings, or not finite; nothing
                 has changed then.
         """
+        self.check_open("set_state")
         check_state(state, self.num_envs)
         check_settings(
             state, self.config, self.groups[0].files
@@ -475,8 +495,9 @@ class EpisodeHost:
     def close(self) -> None:
         """Free the renderers, stop the live view and end the threads; closing twice is fine.
 
-        Later steps run in one thread.
+        Later resets and steps are refused.
         """
+        self.closed = True
         self.pictures.close()
         if self.live:
             self.live.close()
@@ -695,7 +716,7 @@ class SingleView(HostView):
         return frames[0] if frames else None
 
     def close(self) -> None:
-        """Free the renderer's window, and stop the live view; closing twice is fine."""
+        """Free the renderer's window, and stop the live view; later calls are refused. Closing twice is fine."""
         self.host.close()
 
 

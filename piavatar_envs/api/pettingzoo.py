@@ -67,7 +67,7 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
-            ImportError: ``render_mode="human"`` without the extra ``live``.
+            ImportError: a render mode without its extra: ``render`` or, for ``"human"``, ``live``.
             ValueError: an unknown task, render mode or device, or less than one control step.
         """
         task_class = load_task(task)

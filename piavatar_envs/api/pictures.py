@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, body_par
 from piavatar_envs.avatar.skinning import unpack
 from piavatar_envs.config import RenderConfig
 from piavatar_envs.core.arrays import matrices_of
+from piavatar_envs.core.extras import missing
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.sim.bodies import Flesh
 from piavatar_envs.sim.forces import Target
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 #: Render modes of one environment, and of a batch: a live view shows one.
 RENDER_MODES = ("rgb_array", "human")
 BATCH_RENDER_MODES = ("rgb_array",)
+#: Modules that pictures need.
+_DRAWING = ("pyvista", "PIL")
 #: Least time between two scenes sent to a browser [s]: no screen shows more.
 _LEAST_INTERVAL = 1.0 / 60.0
 
@@ -43,6 +47,16 @@ def check_render_mode(render_mode: str | None, modes: tuple[str, ...] = RENDER_M
         known = f"{', '.join(['None', *modes[:-1]])} or {modes[-1]}"
         raise ValueError(f"render_mode={render_mode!r} is not known; use {known}")
     return render_mode
+
+
+def check_extra(render_mode: str | None) -> None:
+    """Refuse pictures without the extra that draws them, before anything is built; nothing heavy is imported.
+
+    Raises:
+        ImportError: ``render_mode="rgb_array"`` without the extra ``render``.
+    """
+    if render_mode == "rgb_array" and (lacking := [name for name in _DRAWING if find_spec(name) is None]):
+        raise missing(f"render_mode={render_mode!r}", lacking[0], "render")
 
 
 def check_batch_render_mode(render_mode: str | None) -> str | None:

@@ -1,29 +1,62 @@
-"""Warp's cache of compiled kernels: an unusable folder is named, and damaged objects are compiled anew."""
+"""Warp's start, quiet, and its cache of kernels: an unusable folder is named, damaged objects are compiled anew."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import warp as wp
+
+_NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
 class KernelCacheError(OSError):
     """The folder of compiled kernels cannot be used; one line with the folder and the remedy."""
 
 
+@cache
 def init_warp() -> None:
     """Initialise Warp, which creates the folder of its cache; initialising it again does nothing.
+
+    Of Warp's default messages only warnings remain, and not that there is no CUDA driver.
 
     Raises:
         KernelCacheError: the folder cannot be created.
     """
+    if wp.config.log_level == wp.LOG_INFO:  # its default: a banner, and a line a module in every process
+        wp.config.log_level = wp.LOG_WARNING
     try:
-        wp.init()
+        with _without_driver_warning():
+            wp.init()
     except OSError as error:
         raise unusable(error) from error
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Hold back Warp's warning of a missing CUDA driver, which it writes in every process of a machine without GPU."""
+    try:
+        before = os.dup(2)  # native code writes there, whatever sys.stderr is
+    except OSError:
+        yield
+        return
+    with tempfile.TemporaryFile() as held:
+        os.dup2(held.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+            held.seek(0)
+            for line in held.read().splitlines(keepends=True):
+                if _NO_DRIVER not in line:
+                    os.write(2, line)
 
 
 def unusable(error: OSError) -> KernelCacheError:

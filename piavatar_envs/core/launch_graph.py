@@ -8,9 +8,11 @@ dozens of modules: :func:`compile_graphs` compiles them in parallel, one a core.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from itertools import groupby, zip_longest
 from typing import Any, TypeVar
@@ -250,15 +252,32 @@ def compile_graphs(graphs: Iterable[LaunchGraph]) -> None:
     graphs = list(graphs)
     for graph in graphs:
         acquire(graph.device)
-    with ThreadPoolExecutor(compiling_threads()) as pool:
-        modules = {
-            (new.kernel.module, each.device.alias, new.block_dim): None for each in graphs for new in each.unbound
-        }
+    modules = {(new.kernel.module, each.device.alias, new.block_dim): None for each in graphs for new in each.unbound}
+    pool = ThreadPoolExecutor(compiling_threads())
+    try:
         loads = [pool.submit(load_module, module, wp.get_device(d), dim) for module, d, dim in modules]
-        for load in loads:
+        for load in _shown(loads):
             load.result()
+    finally:
+        pool.shutdown(cancel_futures=True)  # after an error, or Ctrl-C, modules that wait are not compiled
     for graph in graphs:
         graph.bind()
+
+
+def _shown(loads: Sequence[Future]) -> Iterator[Future]:
+    """Yield the loads as they end, beside a bar where they take longer than a second; in the first process only."""
+    from tqdm import tqdm
+
+    a_terminal = sys.stderr is not None and sys.stderr.isatty()
+    yield from tqdm(
+        as_completed(loads),
+        "kernels, compiled once",
+        len(loads),
+        unit="module",
+        delay=1.0,
+        mininterval=0.1 if a_terminal else 1.0,
+        disable=multiprocessing.parent_process() is not None,
+    )
 
 
 def _can_branch(device: wp.Device) -> bool:
