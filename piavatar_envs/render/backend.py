@@ -34,6 +34,28 @@ class Shot:
         steep = np.hypot(way[0], way[1]) < 1e-3 * abs(way[2])
         return (0.0, 1.0, 0.0) if steep else (0.0, 0.0, 1.0)
 
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Unit vectors that point into the picture, to its right and up in it."""
+        forward = np.asarray(self.target, dtype=np.float64) - self.eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, self.up)
+        right /= np.linalg.norm(right)
+        return forward, right, np.cross(right, forward)
+
+    def focal(self, height: int) -> float:
+        """Return the focal length of a picture ``height`` pixels high [px]."""
+        return float(0.5 * height / np.tan(np.deg2rad(0.5 * self.field_of_view)))
+
+    def project(self, points: np.ndarray, height: int, width: int) -> np.ndarray:
+        """Return the pixels ``(n, 2)``, x to the right and y down, of points ``(V, 3)`` [m] before the camera."""
+        forward, right, up = self.axes
+        relative = np.asarray(points, np.float64) - self.eye
+        depth = relative @ forward
+        relative, depth = relative[depth > 1e-6], depth[depth > 1e-6]
+        scale = self.focal(height) / depth
+        return np.stack([0.5 * width + scale * (relative @ right), 0.5 * height - scale * (relative @ up)], axis=1)
+
 
 class Backend(Protocol):
     """Turns lit vertices into pictures of one size."""

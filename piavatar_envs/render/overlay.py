@@ -16,19 +16,39 @@ _TEXT = (45, 48, 54)
 _BAR_HEIGHT, _BAR_WIDTH = 0.34, 0.022  # of the picture's height
 
 
-def draw_scale(frame: np.ndarray, maximum: float, title: str) -> None:
-    """Draw the colour scale from 0 to ``maximum`` into the lower right corner, in place.
+def draw_scale(frame: np.ndarray, maximum: float, title: str, seen: np.ndarray | None = None, last: int = 0) -> int:
+    """Draw the colour scale from 0 to ``maximum`` into the corner that shows least of the bodies, in place.
 
     Args:
         frame: the picture, shape ``(H, W, 3)`` uint8.
         maximum: the value of the last colour.
         title: what the colours show.
+        seen: pixels of the bodies' vertices, x to the right and y down, shape ``(n, 2)``; none if not given.
+        last: corner of the last picture, where the scale stays while nothing is behind it.
+
+    Returns:
+        The corner: 0 lower right, 1 upper right, 2 lower left, 3 upper left.
     """
     overlay, alpha = _scale_image(frame.shape[0], float(maximum), title)
     height, width = min(overlay.shape[0], frame.shape[0]), min(overlay.shape[1], frame.shape[1])
-    corner = frame[-height:, -width:]
+    places = [
+        (slice(top, top + height), slice(left, left + width))
+        for left in (frame.shape[1] - width, 0)
+        for top in (frame.shape[0] - height, 0)
+    ]
+    behind = np.zeros(len(places)) if seen is None else np.array([_count_in(place, seen) for place in places])
+    corner = last if behind[last] == behind.min() else int(behind.argmin())
+    shown = frame[places[corner]]
     overlay, alpha = overlay[-height:, -width:], alpha[-height:, -width:]
-    corner[:] = (corner * (1.0 - alpha) + overlay * alpha + 0.5).astype(np.uint8)
+    shown[:] = (shown * (1.0 - alpha) + overlay * alpha + 0.5).astype(np.uint8)
+    return corner
+
+
+def _count_in(place: tuple[slice, slice], pixels: np.ndarray) -> int:
+    """Return how many pixels ``(n, 2)``, x and y, lie in rows and columns of a picture."""
+    rows, columns = place
+    x, y = pixels.T
+    return int(((columns.start <= x) & (x < columns.stop) & (rows.start <= y) & (y < rows.stop)).sum())
 
 
 def label(frame: np.ndarray, text: str) -> np.ndarray:

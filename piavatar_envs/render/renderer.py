@@ -51,6 +51,7 @@ class Renderer:
         self.camera = camera or Camera()
         self._follower = Follower(self.camera)
         self._topology: Topology | None = None
+        self._corner = 0  # of the colour scale
         self._backend: Backend | None = _open(backend, self.width, self.height)
 
     def render(
@@ -87,7 +88,9 @@ class Renderer:
         picture = self._backend.draw(topology, vertices, coloring.to_bytes(light.T), ground_shadow(casters), shot)
         for body in bodies:
             if body.scalars is not None:
-                draw_scale(picture, body.scalar_max, body.scalar_label)
+                of_bodies = vertices[: sum(len(body.vertices) for body in bodies)]
+                seen = shot.project(of_bodies, self.height, self.width)
+                self._corner = draw_scale(picture, body.scalar_max, body.scalar_label, seen, self._corner)
                 break
         return picture
 

@@ -53,15 +53,12 @@ class SoftwareBackend:
 
 
 def _view(shot: Shot, size: tuple[int, ...]) -> View:
-    forward = np.asarray(shot.target, dtype=np.float64) - shot.eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, shot.up)
-    right /= np.linalg.norm(right)
+    forward, right, up = shot.axes
     view = View()
     view.eye, view.forward, view.right = wp.vec3(*shot.eye), wp.vec3(*forward), wp.vec3(*right)
-    view.up = wp.vec3(*np.cross(right, forward))
+    view.up = wp.vec3(*up)
     view.height, view.width = size[:2]
-    view.focal = 0.5 * view.height / np.tan(np.deg2rad(0.5 * shot.field_of_view))
+    view.focal = shot.focal(view.height)
     return view
 
 

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from piavatar_envs.render import Arrow, Body, Box, Camera, Renderer, Sphere
+from piavatar_envs.render.backend import Shot
 from piavatar_envs.render.display import opengl_available
+from piavatar_envs.render.overlay import draw_scale
 
 pytest.importorskip("pyvista", reason='needs pip install "piavatar-envs[render]"')
 
@@ -149,6 +151,29 @@ def test_the_shadow_lies_behind_and_fades(renderer, body):
     assert dark[row - 3 : row + 4, column - 3 : column + 4].max() > 15.0
     column, row = project(np.array([[-0.4, -0.7, 0.0]]))[0].astype(int)
     assert np.abs(dark[row - 3 : row + 4, column - 3 : column + 4]).max() < 3.0
+
+
+def test_the_scale_goes_where_it_covers_no_body():
+    """Also in a video, where it stays as long as nothing is behind it."""
+    height, width = 240, 320
+    empty = np.full((height, width, 3), 200, np.uint8)
+    corners = {0: (width - 20, height - 40), 1: (width - 20, 40), 2: (20, height - 40), 3: (20, 40)}
+    for taken in range(4):
+        frame = empty.copy()
+        seen = np.array([place for corner, place in corners.items() if corner <= taken and corner < 3], float)
+        assert draw_scale(frame, 0.2, "strain", seen) == min(taken + 1, 3)
+        x, y = corners[min(taken + 1, 3)]
+        drawn = np.argwhere((frame != empty).any(2)).mean(0)
+        assert (drawn[1] > width / 2) == (x > width / 2) and (drawn[0] > height / 2) == (y > height / 2)
+    assert draw_scale(empty.copy(), 0.2, "strain", np.array([corners[1]], float), last=2) == 2
+    assert draw_scale(empty.copy(), 0.2, "strain", np.array(list(corners.values()), float), last=2) == 2
+
+
+def test_a_shot_projects_as_the_pictures_are_drawn():
+    camera, points = FIXED, np.array([[0.3, 0.55, 0.0], [-0.4, -0.7, 1.2]])
+    shot = Shot(np.asarray(camera.position), np.asarray(camera.target), camera.field_of_view, np.zeros(2))
+    behind = np.concatenate([points, 3.0 * shot.eye[None]])
+    np.testing.assert_allclose(shot.project(behind, SIZE, SIZE), project(points), atol=0.5)
 
 
 def test_strain_colors_and_their_scale(renderer, body, subject):
