@@ -24,6 +24,8 @@ EMPTY: dict[str, Any] = {"gravity": 0.0, "scene": {"ground": False}}
 GRAVITY = 9.81
 #: Middles of chest and head, x and z [m].
 CHEST, HEAD = (0.0, 1.28), (0.0, 1.55)
+#: Greatest volume fraction of a particle at the surface of a body, over the median of the body's.
+AT_SURFACE = 0.93
 
 
 def empty(*props: dict[str, Any], **scene: Any) -> dict[str, Any]:
@@ -183,29 +185,21 @@ class Measurements:
     def overlap(self, chosen: slice, other: slice) -> tuple[float, float]:
         """Return the share of the volume of ``chosen`` that lies inside ``other``, and the depth of the deepest [m].
 
-        Independent of the grid: a particle is inside where the other's density, summed with the cubic spline of
-        smoothed-particle hydrodynamics over a particle spacing, is above half.
+        Independent of the grid: a particle is inside where the other's volume fraction, summed with the cubic spline of
+        smoothed-particle hydrodynamics over a particle spacing, is above half. Volumes are those of the deformed
+        matter: squeezed matter is denser, but does not reach further.
         """
         x, spacing = self.x, float(np.mean(self.volume[other])) ** (1.0 / 3.0)
+        volume = self.volume[other] * np.maximum(self.volume_ratio(other), 0.0)
         places, tree = x[chosen], cKDTree(x[other])
-        inside = _fraction(tree, x[other], self.volume[other], places, spacing) > 0.5
+        inside = _fraction(tree, x[other], volume, places, spacing) > 0.5
         if not inside.any():
             return 0.0, 0.0
-        surface = x[other][self.surface(other)]
+        own = _fraction(tree, x[other], volume, x[other], spacing)
+        surface = x[other][own < AT_SURFACE * np.median(own)]
         depth = cKDTree(surface).query(places[inside])[0].max() + 0.5 * spacing
         volume = self.volume[chosen]
         return float(volume[inside].sum() / volume.sum()), float(depth)
-
-    def surface(self, chosen: slice) -> np.ndarray:
-        """Return the mask of the particles of a body at rest that lie at its surface."""
-        if chosen == self.body:
-            x = self.points.rest[0].astype(float)
-        else:
-            index = [self.prop(i) for i in range(len(self.simulation.props.props))].index(chosen)
-            x = self.simulation.props.props[index].rest.numpy().astype(float)
-        volume = self.volume[chosen]
-        density = _fraction(cKDTree(x), x, volume, x, float(np.mean(volume)) ** (1.0 / 3.0))
-        return density < 0.93 * np.median(density)
 
 
 class Probe(Measurements):
