@@ -62,6 +62,10 @@ SURFACE = wp.constant(0.5)
 #: Slope of the volume fraction at a flat surface times the grid spacing: a step seen through the spline twice has the
 #: slope of the integral of its square, 11/20.
 SURFACE_SLOPE = wp.constant(0.55)
+#: Volume fraction from which depths are measured along ways out, the number of ways, the step between samples, and the
+#: greatest depth [grid spacings].
+NEARLY_FULL = wp.constant(0.85)
+WAYS, STRIDE, MOST_DEPTH = wp.constant(14), wp.constant(0.5), wp.constant(16.0)
 
 
 @wp.func
@@ -308,36 +312,23 @@ def sense_contact(
         sense_particle(grid, particles, blocks, sensors, e, p, xg)
 
 
-@wp.kernel
-def sense_penetration(
+@wp.func
+def fraction_of_others(
     grid: Grid,
-    particles: Particles,
     contact: Contact,
-    x: wp.array2d(dtype=wp.vec3),
     blocks: Blocks,
     node_velocity: wp.array2d(dtype=wp.vec4),
-    failure: wp.array(dtype=int),
-    # in and out
-    penetration: wp.array2d(dtype=float),
+    e: int,
+    own: int,
+    xg: wp.vec3,
 ):
-    """Raise ``penetration`` to the depth of the deepest particle of a subject below the surface of another [m].
-
-    The surface is where the volume fraction of the other, seen through the spline, is one half; depths are linear there
-    and end at 0.9 grid spacings.
-    """
-    e, p = wp.tid()
-    if failure[e] != 0:
-        return
-    xg = grid_position(grid, x[e, p])
+    """Return the volume fraction of all subjects but ``own`` at grid position ``xg``, as the nodes hold it."""
     stencil = stencil_at(xg)
     base = stencil.base
-    if not stencil_inside(grid, base):
-        return
-    if is_single_field(grid, blocks, e, particles.field[p], base):
-        return
-    own = contact.subject[particles.field[p]]
-    around = fields_around(grid, blocks, base, e)
     fraction = float(0.0)
+    if not stencil_inside(grid, base):
+        return fraction
+    around = fields_around(grid, blocks, base, e)
     for g in range(contact.num_fields):
         if has_field(around, g) and contact.subject[g] != own:
             m = float(0.0)
@@ -352,6 +343,64 @@ def sense_penetration(
                                 m += w * mass_of(node_velocity, e, r)
             density = contact.density[row(e, contact.density.shape[0]), g]
             fraction += m * grid.inv_dx * grid.inv_dx * grid.inv_dx / density
-    depth = grid.dx * (wp.min(fraction, 1.0) - SURFACE) / SURFACE_SLOPE
+    return fraction
+
+
+@wp.func
+def way_out(n: int):
+    """Return the unit vector of way ``n`` of :data:`WAYS`: those along the axes, then the diagonals of a cube."""
+    if n < 6:
+        axis = n // 2
+        side = 1.0 - 2.0 * float(n & 1)
+        return side * wp.vec3(float(axis == 0), float(axis == 1), float(axis == 2))
+    x = 1.0 - 2.0 * float(n & 1)
+    y = 1.0 - 2.0 * float((n >> 1) & 1)
+    z = 1.0 - 2.0 * float(((n - 6) >> 2) & 1)
+    return wp.vec3(x, y, z) / wp.sqrt(3.0)
+
+
+@wp.kernel
+def sense_penetration(
+    grid: Grid,
+    particles: Particles,
+    contact: Contact,
+    x: wp.array2d(dtype=wp.vec3),
+    blocks: Blocks,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    failure: wp.array(dtype=int),
+    # in and out
+    penetration: wp.array2d(dtype=float),
+):
+    """Raise ``penetration`` to the depth of the deepest particle of a subject below the surface of another [m].
+
+    The surface is where the volume fraction of the other, seen through the spline, is one half. Near it the fraction
+    gives the depth. Further down, where it is nearly one, the shortest of the ways out along the axes and diagonals
+    does, which exceeds the depth by 15 % at most.
+    """
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    xg = grid_position(grid, x[e, p])
+    base = base_node(xg)
+    if not stencil_inside(grid, base):
+        return
+    if is_single_field(grid, blocks, e, particles.field[p], base):
+        return
+    own = contact.subject[particles.field[p]]
+    fraction = fraction_of_others(grid, contact, blocks, node_velocity, e, own, xg)
+    depth = (fraction - SURFACE) / SURFACE_SLOPE
+    if fraction > NEARLY_FULL:
+        depth = MOST_DEPTH
+        for n in range(WAYS):
+            way = way_out(n)
+            length = float(0.0)
+            here = fraction
+            there = fraction
+            while there > SURFACE and length < depth:
+                here = there
+                length += STRIDE
+                there = fraction_of_others(grid, contact, blocks, node_velocity, e, own, xg + length * way)
+            if there <= SURFACE:
+                depth = wp.min(depth, length - STRIDE * (SURFACE - there) / (here - there))
     if depth > 0.0:
-        wp.atomic_max(penetration, e, own, depth)
+        wp.atomic_max(penetration, e, own, grid.dx * depth)

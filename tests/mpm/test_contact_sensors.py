@@ -46,6 +46,22 @@ def test_penetration_of_a_known_overlap(meet, overlap, density):
     assert overlap < 0.2 or found.all()
 
 
+@pytest.mark.parametrize("depth", [1.0, 1.6, 2.2])
+@pytest.mark.parametrize("turn", [False, True])
+def test_penetration_of_matter_deep_in_other_matter(meet, depth, turn):
+    # A speck in a large cube or ball, at rest: its own particles are a quarter of a spacing apart from its middle.
+    middle = np.array([0.2 - depth * DX, 0.013, 0.007])
+    host = {"ball": ((0.0, 0.0, 0.0), 0.2)} if turn else {"box": ((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2))}
+    if turn:  # half way between an axis and two diagonals of the ways that are tried
+        middle = (0.2 - depth * DX) * np.array([0.88, 0.42, 0.22]) / np.linalg.norm([0.88, 0.42, 0.22])
+    speck = {"box": (tuple(middle - 0.0124), tuple(middle + 0.0124))}
+    sim = meet([host, speck], num_substeps=1, control_dt=1e-4).run()
+    found = sim.scratch.sensors.penetration.numpy()[0, 1]
+    x = sim.rest[sim.of(1)]
+    expected = (0.2 - np.linalg.norm(x, axis=1) if turn else (0.2 - np.abs(x)).min(1)).max()
+    assert found == pytest.approx(expected, abs=0.15 * depth * DX + 0.1 * DX)
+
+
 def test_penetration_of_bodies_that_go_on(meet, device):
     # On tiles: they enter blocks that the last G2P has activated, which hold no velocities yet.
     if device == "cpu":
