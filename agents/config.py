@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -54,6 +55,25 @@ def multi_game(env_id: str) -> Game:
         return load_game(env_id)
     except ImportError as error:
         raise ValueError(f"{env_id} is not importable: {error}") from error
+
+
+def check_imports(env_id: Any, path: Path, imports: Collection[str]) -> None:
+    """Refuse a run whose id imports a module that was not asked for, because importing it runs its code.
+
+    Args:
+        env_id: what the run's file says.
+        path: of that file.
+        imports: modules that may be imported.
+
+    Raises:
+        ConfigError: it names another module, which is not imported yet.
+    """
+    module = str(env_id).rpartition(":")[0]
+    if module and module not in imports and module not in sys.modules:
+        raise ConfigError(
+            f"{path}: env_id={env_id!r} imports the module {module!r}, which runs its code; if you trust it, add "
+            f"--imports {module}"
+        )
 
 
 def load_resolved(

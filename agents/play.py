@@ -24,14 +24,14 @@ from tqdm import tqdm
 
 from agents.checkpoint import read_checkpoint
 from agents.command import one_line_errors, read_options
-from agents.config import EvaluationSettings, changed
+from agents.config import EvaluationSettings, changed, check_imports
 from agents.evaluate import Agent, begin_round, for_all_seats, play
 from agents.files import CHECKPOINT, RESULTS, check_figures
 from agents.report import show_table, versions, write_results
 from agents.sb3.config import load_training
 from agents.sb3.workers import EnvFactory, start_workers
 from piavatar_envs.api.host import EpisodeHost
-from piavatar_envs.config import ConfigError, load_config, parse_assignments
+from piavatar_envs.config import ConfigError, load_config, parse_assignments, read_yaml
 from piavatar_envs.core.rng import check_seeds
 from piavatar_envs.core.writing import check_writable
 from piavatar_envs.doctor import quiet_warp
@@ -62,15 +62,17 @@ class Run:
     make_agent: Callable[[ObservationLayout, int], Agent]
 
 
-def open_run(folder: Path, device: str = "cpu") -> Run:
+def open_run(folder: Path, device: str = "cpu", imports: Collection[str] = ()) -> Run:
     """Open a run by its folder.
 
     Args:
         folder: with config.yaml and policy.pt, policy.zip or, of an interrupted training, checkpoint.pt.
         device: torch's, where a policy of rsl_rl computes.
+        imports: modules that the id of its environment may import.
 
     Raises:
-        ConfigError: there is no such folder, it holds no such run, or the files do not fit each other.
+        ConfigError: there is no such folder, it holds no such run, the files do not fit each other, or it would import
+            another module.
     """
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}; give the one that a training has left, as in runs/")
@@ -80,6 +82,7 @@ def open_run(folder: Path, device: str = "cpu") -> Run:
         raise ConfigError(
             f"{folder} must hold config.yaml and {', '.join(kinds)} or {CHECKPOINT}, as a training leaves them"
         )
+    check_imports(read_yaml(settings).get("env_id", ""), settings, imports)
     # of a training that was resumed and interrupted, the checkpoint is the newer one
     latest = max(found, key=lambda path: (path.stat().st_mtime, path.name != CHECKPOINT))
     if latest.name == CHECKPOINT:
@@ -137,6 +140,8 @@ class Options:
     first_seed: int | None = None
     #: where to simulate
     device: str = "cpu"
+    #: module of a task of your own, which the run may import
+    imports: tuple[str, ...] = ()
     #: JSON file for the figures
     out: Path | None = None
     #: video to write, .mp4 or .gif
@@ -326,7 +331,7 @@ def main(args: list[str] | None = None) -> None:
     scores = options.film is None or options.out is not None or options.episodes is not None
     with one_line_errors(ValueError, ImportError):
         check_options(options)
-        run = open_run(options.run, options.device)
+        run = open_run(options.run, options.device, options.imports)
         task = environment(run, options.settings)
         env = task.config.model_dump(mode="json")
         if options.live:

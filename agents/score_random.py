@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 from agents.command import one_line_errors, read_options
-from agents.config import MOST_RUNS, EvaluationSettings, first_training_seed
+from agents.config import MOST_RUNS, EvaluationSettings, check_imports, first_training_seed
 from agents.evaluate import for_all_seats, over_seeds, play, random_agent
 from agents.files import RESULTS, claim, plain, read_json, write_json
 from agents.report import versions
@@ -38,6 +38,8 @@ class Options:
     seeds: int = 5
     #: how many episodes each, and from which seed on
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    #: module of a task of your own, which the run may import
+    imports: tuple[str, ...] = ()
     #: folder to write to; by default runs/random_ and the name of the run
     out: Path | None = None
     #: where to simulate
@@ -75,6 +77,7 @@ def main(args: list[str] | None = None) -> None:
         check_streams(options.seeds)
         claim(folder, "score_random")
         env_id, env = environment_of(options.run)
+        check_imports(env_id, options.run / RESULTS, options.imports)
         task_class = load_task(env_id)
         config = load_config(task_class.Config, dict(env), parse_assignments(options.settings))
         batch = EpisodeHost(task_class(config), options.evaluation.episodes, options.device)

@@ -30,6 +30,7 @@ from rich.markdown import Markdown
 from agents import compare
 from agents.checkpoint import flattened
 from agents.command import one_line_errors
+from agents.config import check_imports
 from agents.files import (
     RESULTS,
     check_figures,
@@ -140,7 +141,9 @@ def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
     Settings that follow from others where they are null get that value, which older runs recorded.
     """
-    with contextlib.suppress(ValueError):  # a world of several agents, or settings that are no longer there
+    # a world of several agents, settings that are no longer there, or a module that nothing has imported
+    with contextlib.suppress(ValueError):
+        check_imports(env_id, Path(RESULTS), ())
         config = load_config(load_task(env_id).Config, settings)
         settings = config.model_dump(mode="json")
         if config.control.mode == "pose":

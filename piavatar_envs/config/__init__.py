@@ -12,7 +12,7 @@ has one of two sets of settings, by its ``mode``; ``control="pd"`` is short for 
 """
 
 from piavatar_envs.config.errors import ConfigError, UnexpectedKeyword
-from piavatar_envs.config.load import dump_yaml, load_config, load_keywords, parse_assignments, replace
+from piavatar_envs.config.load import dump_yaml, load_config, load_keywords, parse_assignments, read_yaml, replace
 from piavatar_envs.config.schema import (
     FROZEN,
     AvatarConfig,
@@ -57,5 +57,6 @@ __all__ = [
     "load_config",
     "load_keywords",
     "parse_assignments",
+    "read_yaml",
     "replace",
 ]

@@ -140,7 +140,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     return overrides
 
 
-def _read_yaml(path: Path) -> Mapping[str, Any]:
+def read_yaml(path: Path) -> Mapping[str, Any]:
     """Read a YAML file of settings.
 
     Raises:
@@ -207,9 +207,9 @@ def _read_settings(cls: type[BaseModel], path: Path) -> Mapping[str, Any]:
     """Read a YAML file of settings, but refuse that of a training where those of an environment are expected.
 
     Raises:
-        ConfigError: as :func:`_read_yaml`, or the file is that of a training.
+        ConfigError: as :func:`read_yaml`, or the file is that of a training.
     """
-    content = _read_yaml(path)
+    content = read_yaml(path)
     if "env_id" in content and "env_id" not in cls.model_fields:
         raise ConfigError(f"{path} is the file of a training; settings of its environment are those under its key env")
     return content

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,3 +156,27 @@ def test_a_policy_that_does_not_see_a_prop_plays_beside_it(ended):
     with pytest.raises(ValueError, match="changes its observations"):
         play.environment(run, ball)
     assert play.environment(replace(run, observe=("target_position",)), ball).observed_props() == ("ball",)
+
+
+@pytest.mark.parametrize("named", ["spy:Spy/Reach-v0", "spy:ReachTask"])
+def test_what_a_run_imports_is_asked_for(tmp_path, monkeypatch, named):
+    """A run's files name an environment; code of a module that they name runs only where the user names it, too."""
+    (tmp_path / "spy.py").write_text(
+        "import piavatar_envs\nfrom piavatar_envs.tasks.reach import ReachTask\n"
+        "piavatar_envs.register_task('Spy/Reach-v0', ReachTask)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = {"env_id": named, "env": {"fidelity": "tiny"}}
+    (tmp_path / "config.yaml").write_text(f"env_id: {named}\nenv: {{fidelity: tiny}}\n")
+    for name in ("policy.zip", "policy.pt"):
+        (tmp_path / name).write_bytes(b"")
+        assert "--imports spy" in refused(play.main, str(tmp_path))
+        (tmp_path / name).unlink()
+    (tmp_path / "policy.zip").write_bytes(b"")
+    row = {"agent": "trained", "episodes": 1, "return_mean": 0.0}
+    (tmp_path / "results.json").write_text(json.dumps({"config": settings, "results": [row]}))
+    assert "--imports spy" in refused(score_random.main, str(tmp_path), "--out", str(tmp_path / "random"))
+    scores._known(named, settings["env"])
+    assert "spy" not in sys.modules
+    assert "policy.zip holds no policy" in refused(play.main, str(tmp_path), "--imports", "spy")
+    assert sys.modules.pop("spy", None)
