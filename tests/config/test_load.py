@@ -48,6 +48,18 @@ def test_merge_keys_of_yaml_are_followed(tmp_path):
     assert load_config(Task, path).shape.parameters == {"age": 0.5, "weight": 0.2}
 
 
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("017", 17), ("-08", -8), ("1_000", 1000), ("0x1F", 31), ("0", 0), ("1:30", "1:30"), ("1:30.5", "1:30.5"),
+        ("0b11", "0b11"), ("1e5", 1e5), ("-2.5E-3", -2.5e-3), (".5", 0.5), ("3.", 3.0), (".inf", float("inf")),
+    ],
+)  # fmt: skip
+def test_numbers_are_those_of_yaml_1_2(text, value):
+    read = parse_assignments([f"key={text}"])["key"]
+    assert read == value and type(read) is type(value)
+
+
 def test_numpy_and_tuples_are_accepted():
     config = load_config(
         Task, None, {"tone": np.float32(0.5), "span": np.array([0.1, 0.2]), "num_substeps": np.int64(9)}
