@@ -123,9 +123,10 @@ class EpisodeHost:
             )
 
     @property
-    def frame_rate(self) -> int:
-        """Control steps a second."""
-        return round(1.0 / self.config.physics.control_dt)
+    def frame_rate(self) -> float:
+        """Control steps a second; an integer where it is whole, but for the rounding of ``control_dt``."""
+        rate = 1.0 / self.config.physics.control_dt
+        return round(rate) if abs(rate - round(rate)) < 1e-6 * rate else rate
 
     # spaces
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import importlib
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
 
 from piavatar_envs.api.gym_env import AvatarEnv
-from piavatar_envs.config import ConfigError
+from piavatar_envs.api.host import EpisodeHost
+from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from tests.api.runs import bytes_of
 
 ROOT = Path(__file__).parents[2]
@@ -89,6 +91,13 @@ def test_a_yaml_file_and_keywords_configure(tmp_path, device):
     assert env.config.control.tone == 0.25 and env.config.control.alpha == 0.2
     assert env.batch.max_steps == 25
     assert env.metadata["render_fps"] == 50 and AvatarEnv.metadata["render_fps"] == 30
+
+
+@pytest.mark.parametrize(("control_dt", "rate"), [(1.0 / 30.0, 30), (0.02, 50), (0.15, 1.0 / 0.15), (0.03, 1.0 / 0.03)])
+def test_videos_run_as_fast_as_life(control_dt, rate):
+    config = load_config(EnvConfig, None, {"control_dt": control_dt})
+    found = EpisodeHost.frame_rate.fget(SimpleNamespace(config=config))
+    assert found == rate and type(found) is type(rate)
 
 
 def test_stiffness_that_makes_steps_slow_warns(device):
