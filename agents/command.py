@@ -14,6 +14,7 @@ import yaml
 from pydantic import BaseModel
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
+from piavatar_envs.cli import print_any_text
 from piavatar_envs.config import ConfigError, load_config
 
 Options = TypeVar("Options")
@@ -54,6 +55,7 @@ def read_options(cls: type[Options], script: str, args: Sequence[str] | None = N
         script: its name, without ``agents.``.
         args: command line, by default the process's own.
     """
+    print_any_text()
     program = f"python -m agents.{script}"
     with _registry:
         options, unread = tyro.cli(cls, prog=program, args=args, return_unknown_args=True)

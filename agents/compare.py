@@ -19,6 +19,7 @@ from agents.checkpoint import differences
 from agents.command import one_line_errors
 from agents.evaluate import over_seeds
 from agents.files import check_figures, plain, read_json, write_json
+from piavatar_envs.cli import print_any_text
 
 #: Settings that may differ: nothing that is learned depends on how often a training is saved.
 FREE = ("seed", "checkpoint_every")
@@ -121,6 +122,7 @@ class Options:
 
 def main(args: list[str] | None = None) -> None:
     """Run the command line."""
+    print_any_text()
     options = tyro.cli(Options, prog="python -m agents.compare", args=args)
     with one_line_errors(ValueError, OSError):
         if options.out is not None:

@@ -40,6 +40,7 @@ from agents.files import (
     write_atomically,
     write_json,
 )
+from piavatar_envs.cli import print_any_text
 from piavatar_envs.config import load_config
 from piavatar_envs.core.writing import check_writable
 from piavatar_envs.tasks import load_task
@@ -315,6 +316,7 @@ class Options:
 
 def main(args: list[str] | None = None) -> None:
     """Run the command line."""
+    print_any_text()
     options = tyro.cli(Options, prog="python -m agents.scores", args=args)
     with one_line_errors(ValueError, OSError):
         if options.out is not None:

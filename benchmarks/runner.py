@@ -29,6 +29,7 @@ import tyro
 from tqdm import tqdm
 
 from agents.files import describe_run, plain, write_json
+from piavatar_envs.cli import print_any_text
 
 Item = TypeVar("Item")
 
@@ -62,6 +63,7 @@ def main(
         options: :class:`Options` or a subclass.
         args: command line, by default the process's own.
     """
+    print_any_text()
     spec = sys.modules["__main__"].__spec__
     program = spec.name if spec and spec.name.startswith("benchmarks.") else f"benchmarks.{benchmark}"
     chosen = tyro.cli(options, prog=f"python -m {program}", args=args)

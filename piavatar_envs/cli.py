@@ -191,8 +191,16 @@ def hint_settings(args: list[str], options: Container[str]) -> None:
             print(f"error: {name} is a setting of the environment; use -c {name}={value or '...'}", file=sys.stderr)
 
 
+def print_any_text() -> None:
+    """Let standard output and error replace characters that the terminal's encoding lacks, where they would fail."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # not every stand-in of a notebook or a test has it
+            stream.reconfigure(errors="replace")
+
+
 def main(args: list[str] | None = None) -> None:
     """Run a command; a user's mistake ends in one line and exit status 2, Ctrl-C in one line and 130."""
+    print_any_text()
     if (sys.argv[1:] if args is None else list(args)) == ["--version"]:
         from piavatar_envs import __version__
 

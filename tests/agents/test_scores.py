@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import copy
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -202,3 +206,15 @@ def test_runs_of_several_seeds_are_compared(tmp_path, capsys):
     for name in ("nowhere.json", "other.json"):
         with pytest.raises(SystemExit, match=rf"error: .*{name}"):
             compare.main([files[0], str(tmp_path / name)])
+
+
+def test_a_terminal_without_unicode_shows_the_table():
+    results = Path(__file__).parents[2] / "benchmarks" / "results" / "ppo"
+    run = subprocess.run(
+        [sys.executable, "-m", "agents.scores", *map(str, sorted(results.glob("stand_?")))],
+        env=os.environ | {"PYTHONIOENCODING": "ascii", "COLUMNS": "60"},
+        cwd=results.parents[2],
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0 and "PIAvatar/Stand-v0" in run.stdout.replace("\n", ""), run.stderr
