@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import io
 import math
 import re
 import sys
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from types import ModuleType
 from typing import TYPE_CHECKING, TextIO
 
@@ -82,7 +81,7 @@ class Drag:
 
 
 class LiveView:
-    """Shows scenes in every browser that opens :attr:`url`.
+    """Shows scenes in every browser that opens :attr:`url`, until it is closed or collected.
 
     Attributes:
         server: the library's, for panels.
@@ -110,10 +109,10 @@ class LiveView:
             self.server: viser.ViserServer = library.ViserServer(HOST, port, "piavatar-envs", verbose=False)
         # a page of any site could press the hidden button, so no public tunnel may be opened
         self.server.request_share_url = lambda *_arguments, **_more: None
-        atexit.register(self.close)  # without it the library prints a message of its own
+        # also at the end of the process, where the library would print a message of its own
+        self._stop = weakref.finalize(self, _stop, self.server)
         self.url = f"http://{HOST}:{self.server.get_port()}"
         self._set_up(self._follower.camera)
-        self._closed = False
         print(f"live view: {self.url}", flush=True)
 
     def _set_up(self, camera: Camera) -> None:
@@ -175,7 +174,7 @@ class LiveView:
             self._nodes[name] = node = self.server.scene.add_mesh_simple(name, vertices, faces, color=color)
             body = _BODY.match(name)
             if body:
-                node.on_drag("left", modifier=DRAG_KEYS)(partial(self._follow, int(body[1])))
+                node.on_drag("left", modifier=DRAG_KEYS)(_follower(weakref.WeakMethod(self._follow), int(body[1])))
             return
         node.vertices, node.faces, node.color = vertices, faces, color
 
@@ -190,13 +189,30 @@ class LiveView:
         elif self.drag is not None:
             self.drag = replace(self.drag, end=end)
 
+    @property
+    def closed(self) -> bool:
+        """Whether the server was stopped."""
+        return not self._stop.alive
+
     def close(self) -> None:
         """Stop the server; closing twice is fine."""
-        if not self._closed:
-            self._closed = True
-            atexit.unregister(self.close)
-            with _silence():
-                self.server.stop()
+        self._stop()
+
+
+def _stop(server: viser.ViserServer) -> None:
+    with _silence():
+        server.stop()
+
+
+def _follower(follow: weakref.WeakMethod, body: int) -> Callable[[viser.SceneNodeDragEvent], Coroutine]:
+    """Return a handler of drags that does not keep the view: the server, which has threads, keeps its handlers."""
+
+    async def handle(event: viser.SceneNodeDragEvent) -> None:
+        method = follow()
+        if method is not None:
+            await method(body, event)
+
+    return handle
 
 
 def _meshes(scene: Scene) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, Color]]]:

@@ -173,7 +173,7 @@ def test_closing_stops_the_server(make_human):
     view = env.unwrapped.host.live.view
     env.close()
     env.close()
-    assert view._closed
+    assert view.closed
     env.step(np.zeros(env.action_space.shape, np.float32))
     assert env.unwrapped.host.live._view is None, "a reset opens it again"
 

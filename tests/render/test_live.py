@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import socket
 import sys
 import urllib.request
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -169,6 +171,18 @@ def test_the_next_port_is_used_where_one_is_busy(view, capsys):
         with urllib.request.urlopen(url, timeout=5.0) as answer:
             assert answer.status == 200 and b"<html" in answer.read()
     second.close()
+
+
+def test_a_view_that_is_dropped_frees_the_port(body):
+    pytest.importorskip("viser")
+    view = LiveView(port=8200)
+    view.show(Scene([body], []), None)
+    port, gone = port_of(view), weakref.ref(view)
+    del view
+    gc.collect()
+    assert gone() is None
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), timeout=5.0)
 
 
 def test_closing_frees_the_port(capsys, monkeypatch):
