@@ -117,6 +117,12 @@ def test_observations_are_finite_and_none_is_constant(make_env, env_id):
         assert not small, f"{name}{sorted(small)} hardly changes: {spread[sorted(small)]}"
 
 
+def test_environments_with_the_same_body_share_a_skin(make_env):
+    batch = make_env(SAMPLE[0]).batch
+    skins = [SceneReader(batch)._skin(0, 0, batch.simulation.flesh[0]) for _ in range(2)]
+    assert skins[0] is skins[1]
+
+
 def test_the_scene_has_a_body_and_finite_meshes(make_env, env_id):
     env = make_env(env_id)
     env.reset(seed=0)

@@ -104,7 +104,9 @@ class SceneReader:
             points, row = flesh.points, min(env, len(flesh.points.rest) - 1)
             shaped = flesh.asset.shape(flesh.shape_parameters[env])
             self._skins = {other: skin for other, skin in self._skins.items() if other[0] != avatar}
-            self._skins[key] = Skin(flesh.asset, shaped, points.rest[row], points.skin_joints, points.skin_weights)
+            self._skins[key] = Skin.baked(
+                flesh.asset, shaped, points.rest[row], points.skin_joints, points.skin_weights
+            )
         return self._skins[key]
 
     def _avatars(self, env: int, x: np.ndarray, color: str) -> list[Body]:

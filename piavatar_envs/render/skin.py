@@ -6,6 +6,8 @@ the displacement ``x - LBS`` of the particles beneath it. Which particles, and w
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +20,8 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 #: Particles that move a vertex. With few, what neighbours differ by crumples the skin where it is finer than they are:
 #: toes on the ground, between bones that are put into their places and flesh that is not.
 NUM_NEIGHBOURS = 24
+#: Skins that :meth:`Skin.baked` keeps in a process.
+_MOST_BAKED = 8
 #: Particles that move a vertex of a prop.
 _PROP_NEIGHBOURS = 6
 
@@ -78,6 +82,28 @@ class Skin:
             NUM_NEIGHBOURS,
         )
 
+    @classmethod
+    def baked(
+        cls,
+        asset: SkinnedSurface,
+        body: RestShape,
+        rest_positions: np.ndarray,
+        skin_joints: np.ndarray,
+        skin_weights: np.ndarray,
+    ) -> Skin:
+        """Return the skin of these arrays, baked once a process for all environments; arguments as for the class."""
+        digest = hashlib.blake2b()
+        surface = (asset.skin_joints, asset.skin_weights, body.vertices, body.joints)
+        for array in (*surface, rest_positions, skin_joints, skin_weights):
+            digest.update(f"{np.shape(array)} {np.asarray(array).dtype}".encode())
+            digest.update(np.ascontiguousarray(array))
+        key = digest.digest()
+        skin = _baked.pop(key, None) or cls(asset, body, rest_positions, skin_joints, skin_weights)
+        _baked[key] = skin
+        while len(_baked) > _MOST_BAKED:
+            _baked.popitem(last=False)
+        return skin
+
     @property
     def num_vertices(self) -> int:
         """Vertices of the skin mesh."""
@@ -119,6 +145,10 @@ class Skin:
         translations = np.asarray(positions, dtype=np.float64) - np.einsum("bij,bj->bi", rotations, self._rest_joints)
         stacked = np.concatenate([rotations.transpose(0, 2, 1), translations[:, None, :]], axis=1)
         return stacked.reshape(4 * NUM_JOINTS, 3)
+
+
+#: Skins by the digest of what they were baked from, the one that was used last at the end.
+_baked: OrderedDict[bytes, Skin] = OrderedDict()
 
 
 def _skinning_matrix(points: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> sparse.csr_array:

@@ -18,6 +18,20 @@ def test_the_rest_pose_gives_the_rest_vertices(subject):
     np.testing.assert_allclose(vertices, subject.body.vertices, atol=1e-6)
 
 
+def test_the_same_body_is_baked_once(subject):
+    """Environments with equal bodies share a skin; another body, or other particles, have one of their own."""
+    points, asset = subject.particles, subject.asset
+    first, again = (
+        Skin.baked(asset, subject.body, subject.positions.copy(), points.skin_joints.copy(), points.skin_weights)
+        for _ in range(2)
+    )
+    assert first is again
+    other = Skin.baked(asset, subject.body, subject.positions + 1e-3, points.skin_joints, points.skin_weights)
+    assert other is not first
+    rest = other.deform(REST, subject.body.joints, subject.positions + 1e-3)
+    np.testing.assert_allclose(rest, subject.body.vertices, atol=1e-6)
+
+
 def test_a_rigid_motion_is_exact(subject):
     rotation = Rotation.from_rotvec([0.7, -1.9, 0.4]).as_matrix()
     shift = np.array([1.5, -0.7, 2.0])
