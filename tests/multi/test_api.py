@@ -397,7 +397,7 @@ def test_a_game_is_watched_and_pettingzoos_render_test_passes(fresh, play):
     assert game.render() is None
     assert not any(np.array_equal(view._nodes[n].vertices, b) for n, b in zip(bodies, before, strict=True))
     game.close()
-    assert view._closed
+    assert view.closed
 
 
 def test_no_picture_without_a_render_mode(make_game):
