@@ -9,7 +9,7 @@ import numpy as np
 
 from piavatar_envs.render import coloring, shading, vtk_backend
 from piavatar_envs.render.backend import Backend, Shot
-from piavatar_envs.render.display import opengl_available
+from piavatar_envs.render.display import claim_opengl, opengl_available, owns_opengl
 from piavatar_envs.render.geometry import Topology, drawable, topology_key
 from piavatar_envs.render.ground import ground_shadow
 from piavatar_envs.render.overlay import draw_scale
@@ -37,12 +37,14 @@ class Renderer:
             height: of the picture [px].
             camera: the view; by default of a standing person, three-quarters from the front.
             backend: ``"pyvista"`` (OpenGL), ``"software"`` (no graphics driver needed; the CPU) or ``"auto"``: the
-                first where OpenGL works off screen, else the second. They draw the same.
+                first where OpenGL works off screen, else the second. They draw the same. OpenGL is for the main
+                thread, and not for processes that were forked after the first window was opened: a renderer that is
+                used there goes on by software.
 
         Raises:
             ImportError: pyvista is not installed.
             ValueError: a size outside [16, 8192], or an unknown back end.
-            RuntimeError: ``backend="pyvista"`` where there is no OpenGL.
+            RuntimeError: ``backend="pyvista"`` where there is no OpenGL, or where it may not be used.
         """
         for name, value in (("width", width), ("height", height)):
             if not 16 <= value <= 8192:
@@ -78,6 +80,9 @@ class Renderer:
         """
         if self._backend is None:
             raise RuntimeError("this Renderer is closed; make a new one")
+        if isinstance(self._backend, vtk_backend.VtkBackend) and not owns_opengl():
+            _elsewhere.append(self._backend)
+            self._backend = _open("software", self.width, self.height)
         center = self._follower.move(follow, elapsed)
         topology, vertices, colors = self._gather(bodies, markers)
         offset = np.array([*center, 0.0])
@@ -100,9 +105,11 @@ class Renderer:
 
     def close(self) -> None:
         """Free the window; closing twice is fine."""
-        if self._backend is not None:
+        if isinstance(self._backend, vtk_backend.VtkBackend) and not owns_opengl():
+            _elsewhere.append(self._backend)
+        elif self._backend is not None:
             self._backend.close()
-            self._backend = None
+        self._backend = None
 
     def __enter__(self) -> Renderer:
         return self
@@ -129,12 +136,22 @@ class Renderer:
         return self._topology, vertices, np.concatenate(colors)
 
 
+#: Windows of other threads and processes, kept because only these may close them.
+_elsewhere: list[Backend] = []
+
+
 def _open(backend: str, width: int, height: int) -> Backend:
     if backend not in BACKENDS:
         raise ValueError(f"unknown backend {backend!r}; use one of {', '.join(BACKENDS)}")
     # Also without OpenGL, so that a missing extra shows on every machine alike.
     vtk_backend.import_pyvista()
-    if backend != "software" and opengl_available():
+    if backend == "pyvista" and not owns_opengl():
+        raise RuntimeError(
+            "backend='pyvista' is for the main thread, and not for a process that was forked after the first picture; "
+            "use backend='software', or start processes by the method 'spawn'"
+        )
+    if backend != "software" and owns_opengl() and opengl_available():
+        claim_opengl()
         return vtk_backend.VtkBackend(width, height)
     if backend == "pyvista":
         raise RuntimeError(

@@ -263,3 +263,53 @@ def test_nothing_is_printed():
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
     assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+#: Draws in this thread, then by ``DRAW``, a new renderer or the one that has drawn here, and compares the pictures.
+ELSEWHERE = """
+import os, signal, sys, threading
+import numpy as np
+from piavatar_envs.render import Renderer, Sphere
+
+def picture(renderer):
+    return renderer.render([], [Sphere((0, 0, 1), 0.3)]).astype(int)
+
+here, kept = Renderer(64, 64), Renderer(64, 64)
+expected = picture(here)
+picture(kept)
+
+def alike():
+    return all(np.abs(picture(renderer) - expected).mean() < 2.0 for renderer in (Renderer(64, 64), kept))
+
+if sys.argv[1] == "thread":
+    found = []
+    thread = threading.Thread(target=lambda: found.extend(alike() for _ in range(20)))
+    thread.start()
+    while thread.is_alive():
+        picture(here)
+    same = found == 20 * [True]
+else:
+    child = os.fork()
+    if child == 0:
+        signal.alarm(90)
+        os._exit(0 if alike() else 1)
+    same = os.waitpid(child, 0)[1] == 0
+assert same and np.array_equal(picture(here), expected)
+"""
+
+
+@pytest.mark.parametrize(
+    "place", ["thread", pytest.param("fork", marks=pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork"))]
+)
+def test_pictures_elsewhere_are_the_same(place):
+    """Other threads drew noise, and forked processes waited for ever, once the process had drawn by OpenGL."""
+    result = subprocess.run([sys.executable, "-c", ELSEWHERE, place], capture_output=True, text=True, timeout=180)
+    assert result.returncode == 0 and "ERR" not in result.stderr, result.stderr
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a variable that VTK reads on Linux")
+def test_a_window_that_vtk_cannot_open_is_not_opened():
+    code = "from piavatar_envs.render import Renderer, Sphere; Renderer(64, 64).render([], [Sphere((0, 0, 1), 0.3)])"
+    environment = os.environ | {"VTK_DEFAULT_OPENGL_WINDOW": "nonsense"}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=180)
+    assert result.returncode == 0, result.stderr
