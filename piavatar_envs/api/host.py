@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.config import replace as replace_settings
 from piavatar_envs.config.load import plain
+from piavatar_envs.core.capture_lock import CAPTURE
 from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.core.rng import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
@@ -37,6 +39,17 @@ MANY_SUBSTEPS = 300
 #: Time of a particle's substep on a CPU core, of default bodies [s]; see docs/performance.md.
 SUBSTEP_TIME = 2.5e-7
 Limited = TypeVar("Limited", bound=EnvConfig)
+
+
+def _alone(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a method exclude the environments of other threads: it builds, captures, or launches kernels one by one."""
+
+    @functools.wraps(method)
+    def locked(*args: Any, **kwargs: Any) -> Any:
+        with CAPTURE.exclusive():
+            return method(*args, **kwargs)
+
+    return locked
 
 
 class EpisodeHost:
@@ -62,6 +75,7 @@ class EpisodeHost:
         live: the live view of the only environment, or None.
     """
 
+    @_alone
     def __init__(
         self,
         task: Task,
@@ -146,6 +160,7 @@ class EpisodeHost:
 
     # episodes
 
+    @_alone
     def reset(self, seeds: int | Sequence[int | None] | None = None, mask: np.ndarray | None = None) -> None:
         """Begin new episodes.
 
@@ -238,7 +253,8 @@ class EpisodeHost:
         """Advance by one control step under actions that the caller has checked; at most in real time with a view."""
         if self.live:
             self.live.before_step()
-        self.api.write(actions, [group.action for group in self.groups])
+        with CAPTURE.shared():
+            self.api.write(actions, [group.action for group in self.groups])
         self._run(BatchEnv.step)
         if self.live:
             self.live.step()
@@ -280,18 +296,21 @@ class EpisodeHost:
 
     def _run(self, graph: Callable[[BatchEnv], Any]) -> None:
         """Run a method of every group, each in its own thread."""
-        self.api.begin()
-        if self._pool is None or graph not in self._captured:
-            # Warp records one graph at a time, so the first runs follow each other
-            for group in self.groups:
-                graph(group)
+        if graph not in self._captured:
+            with CAPTURE.exclusive():
+                self.api.begin()
+                for group in self.groups:
+                    graph(group)
+                self.api.end()
             self._captured.add(graph)
-        else:
-            running = [self._pool.submit(graph, group) for group in self.groups[1:]]
+            return
+        with CAPTURE.shared():
+            self.api.begin()
+            running = [self._pool.submit(graph, group) for group in self.groups[1:]] if self._pool else []
             graph(self.groups[0])
             for result in running:
                 result.result()
-        self.api.end()
+            self.api.end()
 
     # arrays of all environments, always copies
 
@@ -382,6 +401,7 @@ class EpisodeHost:
         states = [group.get_state() for group in self.groups]
         return {name: np.concatenate([state[name] for state in states]) for name in states[0]}
 
+    @_alone
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Restore the result of :meth:`get_state`, under any number of threads.
 
@@ -398,6 +418,7 @@ class EpisodeHost:
         if self.live:
             self.live.begin()
 
+    @_alone
     def adopt(self, state: dict[str, np.ndarray], ready: bool) -> None:
         """Take over the state of another host and whether it is ready; a live view opens at the next reset."""
         state = self.with_forces(state)
@@ -408,6 +429,7 @@ class EpisodeHost:
         self.api.end()
         self.ready = ready
 
+    @_alone
     def assist_root(self, share: float | np.ndarray) -> None:
         """Set the share of root assistance from now on; see :meth:`BatchEnv.assist_root`.
 
@@ -418,6 +440,7 @@ class EpisodeHost:
         for group, part in zip(self.groups, parts, strict=True):
             group.assist_root(part)
 
+    @_alone
     def apply_force(
         self,
         target: str,
@@ -478,6 +501,7 @@ class EpisodeHost:
 
     # pictures
 
+    @_alone
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every environment, ``(height, width, 3)`` uint8, with ``render_mode="rgb_array"``; else return None.
 

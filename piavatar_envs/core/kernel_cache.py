@@ -13,6 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from piavatar_envs.core.capture_lock import CAPTURE
+
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
@@ -32,7 +34,7 @@ def init_warp() -> None:
     if wp.config.log_level == wp.LOG_INFO:  # its default: a banner, and a line a module in every process
         wp.config.log_level = wp.LOG_WARNING
     try:
-        with _without_driver_warning():
+        with CAPTURE.exclusive(), _without_driver_warning():
             wp.init()
     except OSError as error:
         raise unusable(error) from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -101,6 +102,21 @@ def test_videos_run_as_fast_as_life(control_dt, rate):
     config = load_config(EnvConfig, None, {"control_dt": control_dt})
     found = EpisodeHost.frame_rate.fget(SimpleNamespace(config=config))
     assert found == rate and type(found) is type(rate)
+
+
+def test_threads_build_and_step_environments_at_the_same_time(device, equal):
+    """Warp captures one graph at a time, and records what other threads launch meanwhile instead of doing it."""
+
+    def play(seed: int) -> list[np.ndarray]:
+        env = gymnasium.make("PIAvatar/Reach-v0", device=device, fidelity="tiny", alpha=0.1 + 0.1 * (seed % 2))
+        seen = [env.reset(seed=seed)[0]]
+        seen += [env.step(np.full(env.action_space.shape, 0.3, np.float32))[0] for _ in range(5)]
+        env.close()
+        return seen
+
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(play, range(4)))
+    assert all(equal(ours, alone) for seed in range(4) for ours, alone in zip(together[seed], play(seed), strict=True))
 
 
 def test_stiffness_that_makes_steps_slow_warns(device):
