@@ -54,7 +54,9 @@ def setting_keys(cls: type[BaseModel]) -> tuple[str, ...]:
 
 def section_of(annotation: Any) -> type[BaseModel] | None:
     """Return the model that a field nests, or None for a plain value."""
-    return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+    # in Python 3.10, a generic such as tuple[int, int] is a type, too
+    plain = get_origin(annotation) is None and isinstance(annotation, type)
+    return annotation if plain and issubclass(annotation, BaseModel) else None
 
 
 def variants_of(field: FieldInfo) -> dict[str, type[BaseModel]]:

@@ -158,13 +158,10 @@ def test_a_policy_that_does_not_see_a_prop_plays_beside_it(ended):
     assert play.environment(replace(run, observe=("target_position",)), ball).observed_props() == ("ball",)
 
 
-@pytest.mark.parametrize("named", ["spy:Spy/Reach-v0", "spy:ReachTask"])
-def test_what_a_run_imports_is_asked_for(tmp_path, monkeypatch, named):
+def test_what_a_run_imports_is_asked_for(tmp_path, monkeypatch):
     """A run's files name an environment; code of a module that they name runs only where the user names it, too."""
-    (tmp_path / "spy.py").write_text(
-        "import piavatar_envs\nfrom piavatar_envs.tasks.reach import ReachTask\n"
-        "piavatar_envs.register_task('Spy/Reach-v0', ReachTask)\n"
-    )
+    named = "spy:ReachTask"
+    (tmp_path / "spy.py").write_text("from piavatar_envs.tasks.reach import ReachTask\n")
     monkeypatch.syspath_prepend(tmp_path)
     settings = {"env_id": named, "env": {"fidelity": "tiny"}}
     (tmp_path / "config.yaml").write_text(f"env_id: {named}\nenv: {{fidelity: tiny}}\n")
