@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import re
+import shutil
 import sys
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import warp as wp
@@ -107,6 +110,32 @@ def _own_cache() -> Path:
 
 
 @contextmanager
+def _compiled_once(path: Path, folder: Path) -> Iterator[bool]:
+    """Hold a lock on a module; yields whether ``path`` must be compiled, else it is a copy of another process's object.
+
+    Objects are kept in ``folder``.
+
+    Without file locks (Windows) every process compiles.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield True
+        return
+    kept = folder / path.name
+    folder.mkdir(parents=True, exist_ok=True)
+    with kept.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if kept.exists():
+            shutil.copy(kept, path)
+            yield False
+        else:
+            yield True
+            shutil.copy(path, kept.with_suffix(".new"))
+            kept.with_suffix(".new").replace(kept)
+
+
+@contextmanager
 def gpu_on_cpu() -> Iterator[str]:
     """Build and run GPU kernels on the CPU; yields the name of the device.
 
@@ -128,10 +157,18 @@ def gpu_on_cpu() -> Iterator[str]:
             raise RuntimeError("block_dim=1 would run the CPU branches of snippets; use 2 threads or more")
         return threads
 
-    def build_cpu(obj_path: str, cpp_path: str, *args: Any, **kwargs: Any) -> Any:
-        path = Path(cpp_path)
+    compiled: set[int] = set()
+    first_of_its_size = Lock()
+
+    def build_cpu(obj_path: str, cpp_path: str, *args: Any, **kwargs: Any) -> None:
+        path, size = Path(cpp_path), kwargs["block_dim"]
         path.write_text(on_cpu(path.read_text()))
-        return compile_cpu(obj_path, cpp_path, *args, **kwargs)
+        with _compiled_once(Path(obj_path), objects) as missing:
+            if missing:
+                # threads share precompiled headers, one set for each size of a block
+                with nullcontext() if size in compiled else first_of_its_size:
+                    compile_cpu(obj_path, cpp_path, *args, **{**kwargs, "pch_dir": headers.name})
+                compiled.add(size)
 
     def stream(device: Any, **kwargs: Any) -> Any:
         return Stream() if device == NAME else make_stream(device, **kwargs)
@@ -139,6 +176,7 @@ def gpu_on_cpu() -> Iterator[str]:
     def on_stream(stream: Any, **kwargs: Any) -> Any:
         return scoped_stream(None if isinstance(stream, Stream) else stream, **kwargs)
 
+    headers, objects = tempfile.TemporaryDirectory(prefix="headers_"), _own_cache() / "objects"
     get_device, compile_cpu, blocks = wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks
     make_stream, scoped_stream = wp.Stream, wp.ScopedStream
     caches = wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir
