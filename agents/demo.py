@@ -37,7 +37,7 @@ FILM_EPISODES = 2
 PLAYED = 4
 #: Files that appear after the training.
 LATER = ("policy.zip", "curve.csv", "curve.png", "before_after.mp4")
-_RESERVE = 1.25  # margin on the estimated time after the training; half of all time at most is kept for it
+_RESERVE = 1.25  # margin on the estimated time after the training
 _FRAME = 0.1  # rendering and encoding a frame whose halves are drawn in parallel, on slow cores [s]
 
 
@@ -118,8 +118,9 @@ def run(options: Options, console: Console, stop: StopRequest | None = None) -> 
             if stop.made:
                 return begun
             after = _RESERVE * time_after(options, config, facts, seconds / max(1, steps))
-            return begun + options.seconds - min(after, 0.5 * options.seconds)
+            return max(begun + options.seconds - after, started + 0.5 * options.seconds)
 
+        started = time.monotonic()
         with stop.listening():
             model, curve = train(config, venv, facts, options.out, deadline=deadline)
         stop.obey(f"{model.num_timesteps} of {config.total_steps} steps")
