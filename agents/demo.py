@@ -98,7 +98,7 @@ def run(options: Options, console: Console, stop: StopRequest | None = None) -> 
     claim(options.out, "demo", own=("policy.zip",))
     make = factory(config, options.device)
     console.print(
-        f"{config.env_id}: PPO trains the arms for {config.total_steps} steps; all takes {options.seconds:g} s at most"
+        f"{config.env_id}: PPO trains the arms for {config.total_steps} steps; all takes about {options.seconds:g} s"
     )
     facts = prepare(make)
     seen = components(facts.layout, config.observe)
