@@ -451,7 +451,8 @@ def single_infos(infos: Mapping[str, Any], num_envs: int) -> list[dict[str, Any]
         if isinstance(values, dict):
             values = single_infos(values, num_envs)
         elif values.ndim == 1:
-            values = values.tolist()
+            # a real number is NumPy's float64, as in the info of a single environment
+            values = [np.float64(v) if isinstance(v, float) else v for v in values.tolist()]
         for env, held in enumerate(mask.tolist()):
             if held:
                 rows[env][name[1:]] = values[env]
