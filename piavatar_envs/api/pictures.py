@@ -486,10 +486,7 @@ class Live:
         self.view.show(scene, self._progress.since_last())
 
     def close(self) -> None:
-        """Stop the server, if it was started; closing twice is fine.
-
-        A reset opens it again, a step does not.
-        """
+        """Stop the server, if it was started; closing twice is fine."""
         if self._view is not None:
             self._view.close()
             self._view = None

@@ -41,13 +41,20 @@ def run(vector, actions) -> list:
     return answers
 
 
+def vector_of(singles, **keywords) -> SyncVectorEnv:
+    """Return Gymnasium's vector of environments that other tests share; collected ones close theirs in release 1.1."""
+    vector = SyncVectorEnv([lambda env=env: env for env in singles], **keywords)
+    vector.closed = True
+    return vector
+
+
 @pytest.mark.parametrize(("name", "mode", "obs_mode"), CASES)
 def test_it_equals_gymnasiums_vector_of_single_environments(make_vec, make_env, same, name, mode, obs_mode):
     """Compare bit for bit, infos and all: over ends at different times, a failure, and the episodes after these."""
     settings = {**SHORT, "obs_mode": obs_mode}
     vector = make_vec(name, 3, autoreset_mode=mode, **settings)
     singles = [make_env(name, twin=twin, **settings) for twin in range(3)]
-    oracle = SyncVectorEnv([lambda env=env: env for env in singles], autoreset_mode=mode)
+    oracle = vector_of(singles, autoreset_mode=mode)
     assert vector.metadata == {**oracle.metadata, "render_modes": ["rgb_array"]}
     for space in ("action_space", "observation_space", "single_action_space", "single_observation_space"):
         assert getattr(vector, space) == getattr(oracle, space)
@@ -73,7 +80,7 @@ def test_random_bodies_and_worlds_equal_those_of_single_environments(make_vec, m
     settings = {"shape.randomize": True, "mass_factor": (0.8, 1.25), "stiffness_factor": (0.8, 1.25), **SHORT}
     vector = make_vec(KICK, 3, autoreset_mode=SAME_STEP, **settings)
     singles = [make_env(KICK, twin=twin, **settings) for twin in range(3)]
-    oracle = SyncVectorEnv([lambda env=env: env for env in singles], autoreset_mode=SAME_STEP)
+    oracle = vector_of(singles, autoreset_mode=SAME_STEP)
     same(vector.reset(seed=3), oracle.reset(seed=3))
     for step, action in enumerate(actions_of(vector, 8)):
         same(vector.step(action), oracle.step(action), f"{step}")
@@ -513,7 +520,7 @@ def test_gymnasiums_wrappers_accept_it(device, mode):
 def pair(make_vec, make_env):
     """A vector, and Gymnasium's of the same environments."""
     singles = [make_env(REACH, twin=twin, **SHORT) for twin in range(2)]
-    oracle = SyncVectorEnv([lambda env=env: env for env in singles])
+    oracle = vector_of(singles)
     vector = make_vec(REACH, 2, **SHORT)
     for env in (vector, oracle):
         env.reset(seed=31)
