@@ -57,8 +57,8 @@ test-lowest: install
 	PYTHONPATH=$(LOWEST) $(PYTEST) tests/api/test_gymnasium.py tests/api/test_vector.py tests/multi/test_api.py \
 	  -k "not picture and not camera and (test_gymnasium or Kick or pettingzoo or wrappers or first_reset)"
 
-# Clients of other projects in a folder of their own, installed anew after their pins change. One process, whose
-# imports take longer than its tests.
+# Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
+# imports and compilation take longer than the tests.
 CLIENTS := $(VENV)/clients
 $(CLIENTS)/.installed: $(STAMP) tests/clients/requirements.txt
 	rm -rf $(CLIENTS)
@@ -66,7 +66,7 @@ $(CLIENTS)/.installed: $(STAMP) tests/clients/requirements.txt
 	@touch $@
 
 clients-light: $(CLIENTS)/.installed
-	PYTHONPATH=$(CLIENTS) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/clients
+	PYTHONPATH=$(CLIENTS) OMP_NUM_THREADS=1 NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest --durations 10 tests/clients
 
 lint: install
 	$(BIN)/ruff check .
