@@ -33,4 +33,4 @@ def arrays_in(answer) -> Iterator:
 
 def on_host(array) -> np.ndarray:
     """Return an array or a tensor as a NumPy array, without a copy on a CPU."""
-    return array if isinstance(array, np.ndarray) else array.cpu().numpy()
+    return np.asarray(array) if isinstance(array, (np.ndarray, np.generic)) else array.cpu().numpy()
