@@ -18,6 +18,11 @@ impulses of a node then do not add up to zero, and momentum is lost. It can be s
 Fields share nodes while their matter is still a grid spacing apart. A gate on the gap between their surfaces lets
 bodies come closer.
 
+Contact of subjects acts on the gap as well (:func:`closing_speed`). Those that would close far past the gate within a
+substep are slowed before: a constraint on the gap at its end (Stewart & Trinkle, "An Implicit Time-Stepping Scheme for
+Rigid Body Dynamics with Inelastic Collisions and Coulomb Friction", 1996). Those that are deep in each other part
+(Baumgarte, "Stabilization of Constraints and Integrals of Motion in Dynamical Systems", 1972).
+
 The kernel here updates the nodes of contact blocks: contact, then colliders, then physical velocities. Such blocks are
 few, and the kernel is bound by memory latency. Nearly all nodes have two fields: :func:`solve_pair` loads all of their
 data at once and keeps it in registers.
@@ -78,6 +83,13 @@ from piavatar_envs.mpm.types import (
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
+#: How far subjects may close past the gate in a substep, twice the error of :func:`surface_gap` [grid spacings].
+OVERSHOOT = wp.constant(0.2)
+#: Depth from which subjects part [grid spacings], beyond the error of gaps; the share of the rest by which they do so
+#: in a substep; its limit [grid spacings], a tenth of the way of elastic waves at a Courant number of 0.5; and the
+#: least volume of both at a node [cells], below which gaps are not reliable.
+DEEP, PARTING, MOST_PARTING, FILLED = wp.constant(0.3), wp.constant(0.2), wp.constant(0.05), wp.constant(0.1)
+
 
 @wp.func
 def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: float):
@@ -108,8 +120,25 @@ def store_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3,
 
 
 @wp.func
+def closing_speed(grid: Grid, step: Step, gap: float, gate: float, filled: float):
+    """Return the greatest speed at which two subjects may close at a node [m/s]; negative where they part.
+
+    It is zero in the usual contact: closer than the ``gate`` [m], and less than :data:`DEEP` in each other. ``filled``
+    is the lesser of their volumes at the node [cells].
+    """
+    way = float(0.0)
+    deep = -gap - DEEP * grid.dx
+    if gap >= gate:
+        way = gap - gate + OVERSHOOT * grid.dx
+    elif deep > 0.0 and filled > FILLED:
+        way = -wp.min(PARTING * deep, MOST_PARTING * grid.dx)
+    return way / step.dt
+
+
+@wp.func
 def impulse_between(
     grid: Grid,
+    step: Step,
     contact: Contact,
     e: int,
     a: int,
@@ -120,14 +149,17 @@ def impulse_between(
     offset_b: wp.vec4,
     n_ab: wp.vec3,
 ):
-    """Return the impulse [N s] that field ``a`` gives ``b`` at a node, zero beyond the gate."""
+    """Return the impulse [N s] that field ``a`` gives ``b`` at a node, zero for those that stay beyond the gate."""
     apart = offset_a / va[0] - offset_b / vb[0]
     distance = wp.dot(n_ab, wp.vec3(apart[0], apart[1], apart[2]))
     V_a = volume_at(grid, contact, e, a, va[0])
     V_b = volume_at(grid, contact, e, b, vb[0])
-    if surface_gap(grid, V_a, V_b, distance) >= contact.gate:
-        return wp.vec3()
+    gap = surface_gap(grid, V_a, V_b, distance)
     approach = wp.vec3(va[1] - vb[1], va[2] - vb[2], va[3] - vb[3])
+    if contact.subject[a] != contact.subject[b]:
+        approach -= closing_speed(grid, step, gap, contact.gate, wp.min(V_a, V_b)) * n_ab
+    elif gap >= contact.gate:
+        return wp.vec3()
     pairs = row(e, contact.friction.shape[0])
     return coulomb(va[0], vb[0], approach, n_ab, contact.friction[pairs, a * contact.num_fields + b])
 
@@ -144,6 +176,7 @@ def store_pair_impulse(contact: Contact, e: int, a: int, b: int, J: wp.vec3, sen
 @wp.func
 def collide_pair(
     grid: Grid,
+    step: Step,
     contact: Contact,
     blocks: Blocks,
     accumulators: Accumulators,
@@ -166,7 +199,7 @@ def collide_pair(
     n_ab = shared_normal(grid, blocks, e, node_of_block(block_corner(grid, block), local), a, b, volume_gradient)
     offset_a = offset_at(grid, accumulators, e, a, ra)
     offset_b = offset_at(grid, accumulators, e, b, rb)
-    J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
+    J = impulse_between(grid, step, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
     if wp.length_sq(J) <= 0.0:
         return
     write_record(node_velocity, e, ra, va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0])
@@ -266,7 +299,7 @@ def solve_node(
                 for b in range(a + 1, end):
                     if has_field(candidates, b):
                         collide_pair(
-                            grid, contact, blocks, accumulators, e, block, local, a, b, volume_gradient,
+                            grid, step, contact, blocks, accumulators, e, block, local, a, b, volume_gradient,
                             node_velocity, sensors,
                         )  # fmt: skip
     for f in range(contact.num_fields):
@@ -335,7 +368,7 @@ def solve_pair(
     change_b = wp.vec4()
     if candidates and va[0] > MASS_MIN and vb[0] > MASS_MIN:
         n_ab = normal_from(grid, e, node, around_a, around_b, volume_gradient)
-        J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
+        J = impulse_between(grid, step, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
         if wp.length_sq(J) > 0.0:
             dv = J / va[0]
             change_a = wp.vec4(-dv[0], -dv[1], -dv[2], float(contact.subject[b]))

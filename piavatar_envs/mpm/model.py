@@ -16,6 +16,7 @@ from piavatar_envs.mpm.cuda.tiled_p2g import plan_tiles
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.memory import bound_active_blocks, check_memory, choose_activation_interval
 from piavatar_envs.mpm.types import (
+    CFL_STABLE,
     DECOUPLING,
     PATHS,
     Contact,
@@ -26,10 +27,6 @@ from piavatar_envs.mpm.types import (
 )
 
 wp.set_module_options({"enable_backward": False})
-
-
-#: Largest stable ``c dt / dx`` (measured 0.84 to 1.04, less near incompressibility).
-CFL_STABLE = 0.84
 
 
 #: Most velocity fields: one bit of an int32 each, without the sign.

@@ -17,6 +17,7 @@ import warp as wp
 from piavatar_envs.core.arrays import matrix_at, vec8
 from piavatar_envs.mpm.bspline import BLOCK_NODES, Stencil, grid_position, stencil_at
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
+from piavatar_envs.mpm.compression import shock_pressure
 from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC
 from piavatar_envs.mpm.materials import kirchhoff_stress, viscous_stress
 from piavatar_envs.mpm.sparse_grid import HALVES, VECTORS, fields_around, slab_records, store_candidate
@@ -240,15 +241,20 @@ def with_momentum(s: Deposit, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
 
 
 @wp.func
-def stress_impulse(grid: Grid, step: Step, particles: Particles, e: int, p: int, F: wp.mat33, C: wp.mat33):
-    """Return :func:`impulse_of_stress` of particle ``p`` with deformation and velocity gradients ``F`` and ``C``."""
+def stress_impulse(grid: Grid, step: Step, particles: Particles, e: int, p: int, m: float, F: wp.mat33, C: wp.mat33):
+    """Return :func:`impulse_of_stress` of a particle of mass ``m``.
+
+    ``F`` and ``C`` are its gradients of deformation and velocity.
+    """
     mu = particles.mu[row(e, particles.mu.shape[0]), p]
     lam = particles.lam[row(e, particles.lam.shape[0]), p]
     tau = kirchhoff_stress(particles.material[row(e, particles.material.shape[0]), p], F, mu, lam)
     retardation = particles.retardation[row(e, particles.retardation.shape[0]), p]
     if retardation > 0.0:
         tau += viscous_stress(C, wp.determinant(F), mu, lam, retardation)
-    return impulse_of_stress(grid, step, particles.volume[row(e, particles.volume.shape[0]), p], tau)
+    volume = particles.volume[row(e, particles.volume.shape[0]), p]
+    q = shock_pressure(-wp.trace(C), m / volume, lam + 2.0 * mu, retardation, grid.dx, step.dt)
+    return impulse_of_stress(grid, step, volume, tau - wp.diag(wp.vec3(q)))
 
 
 @wp.func
@@ -263,7 +269,7 @@ def deposit_of(grid: Grid, step: Step, particles: Particles, moving: Moving, e: 
     C = matrix_at(moving.C, e, p)  # loaded before the stress, which hides its latency
     stress = wp.mat33()
     if step.decoupling != NO_STRESS:
-        stress = stress_impulse(grid, step, particles, e, p, matrix_at(moving.F, e, p), C)
+        stress = stress_impulse(grid, step, particles, e, p, m, matrix_at(moving.F, e, p), C)
     k = wp.vec3()
     if candidate or step.decoupling == PAPER:
         k = m * moving.vk[e, p]

@@ -35,6 +35,7 @@ def meet(simulate) -> Callable[..., Matter]:
         spacing: float = 0.025,
         stiffness: float = 100.0,
         retardation: float = 0.0,
+        material: str = "neo_hookean",
         domain: Sequence[Sequence[float]] = ((-1.0, -0.8, -0.8), (1.0, 0.8, 0.8)),
         **kwargs,
     ) -> Matter:
@@ -44,7 +45,7 @@ def meet(simulate) -> Callable[..., Matter]:
         fields = Fields(tuple(range(len(bodies))), friction, density, gate, normals, len(bodies))
         field = np.repeat(np.arange(len(bodies)), counts)
         points = replace(
-            MaterialPoints.uniform(np.full(len(field), spacing**3), retardation=retardation),
+            MaterialPoints.uniform(np.full(len(field), spacing**3), material=material, retardation=retardation),
             density=density[None, field],
             young_modulus=stiffness * density[None, field],
             field=field,

@@ -2,13 +2,16 @@
 
 Energy density ``psi = mu |F - R|^2 + lam/2 (J - 1)^2`` with the rotation ``R`` of the polar decomposition ``F = R S``
 (Stomakhin et al., "Energetically Consistent Invertible Elasticity", 2012). ``R`` comes from Newton's iteration
-(Higham, "Computing the Polar Decomposition", 1986), several times cheaper than a singular value decomposition.
+(Higham, "Computing the Polar Decomposition", 1986), several times cheaper than a singular value decomposition. The
+barrier of :mod:`piavatar_envs.mpm.compression` joins: the energy alone is finite for matter without volume.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import warp as wp
+
+from piavatar_envs.mpm.compression import barrier_energy, barrier_stress
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,7 +28,7 @@ def energy(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
     """Return the energy density [Pa] of deformation gradients ``F``, shape ``(..., 3, 3)``, ``det F > 0``."""
     stretches = np.linalg.svd(F, compute_uv=False)
     J = np.linalg.det(F)
-    return mu * ((stretches - 1.0) ** 2).sum(-1) + 0.5 * lam * (J - 1.0) ** 2
+    return mu * ((stretches - 1.0) ** 2).sum(-1) + 0.5 * lam * (J - 1.0) ** 2 + barrier_energy(J, mu, lam)
 
 
 @wp.func
@@ -54,4 +57,5 @@ def kirchhoff_stress(F: wp.mat33, mu: float, lam: float):
     """Return the Kirchhoff stress ``tau = (d psi / d F) F^T`` [Pa]."""
     R = polar_rotation(F)
     J = wp.determinant(F)
-    return 2.0 * mu * ((F - R) * wp.transpose(F)) + wp.diag(wp.vec3(lam * (J - 1.0) * J))
+    pressure = lam * (J - 1.0) * J + barrier_stress(J, mu, lam)
+    return 2.0 * mu * ((F - R) * wp.transpose(F)) + wp.diag(wp.vec3(pressure))
