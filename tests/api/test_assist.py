@@ -10,7 +10,7 @@ from piavatar_envs.envs.parameters import ASSIST, PARAMETERS
 
 STAND = "PIAvatar/Stand-v0"
 SETTINGS = {"fidelity": "tiny", "control": "torque", "pose_noise": 0.0, "episode_seconds": 20.0}
-STEPS = 30
+STEPS = 60
 
 
 def vector_view(device, **settings):
