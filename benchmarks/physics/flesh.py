@@ -20,7 +20,7 @@ SWING_RATE, SWING = 1.0, 0.5  # frequency of legs [Hz], and amplitude as a share
 TRUNK = ("pelvis", "spine1", "spine2", "spine3")
 WAIST = (1.0, 1.14)  # height of the waist at rest [m]
 LONGEST_EDGE, LEAST_VOLUME = 0.06, 2.0e-7  # of tetrahedra between particles of the trunk [m], [m^3]
-POLICIES = {"stand": "ppo/stand_4", "walk": "ppo/walk_1"}
+POLICIES = {"stand": "ppo/stand_0", "walk": "ppo/walk_0"}
 
 
 def swing_legs(env: BatchEnv, seconds: float, start: float = 0.0) -> None:
