@@ -13,6 +13,7 @@ from benchmarks.physics.checks import Options, Quantity, at_least, at_most, chec
 from benchmarks.physics.probe import EMPTY, GRAVITY, Probe, beyond
 from piavatar_envs.avatar.body.muscles import LOCKED_JOINTS, make_muscles
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
+from piavatar_envs.avatar.torque_control.joint_tissue import RETARDATION_TIME
 
 LIFT_SPEED = 0.05  # of a box that rises against a limb [m/s]
 SETTLING = 2.0  # time for a load to be carried [s]
@@ -48,7 +49,7 @@ LIFTS = {
 
 
 def stiffness(options: Options, control: str, lift: Lift) -> Iterator[Quantity]:
-    """Bend a joint by a box, and compare moment over angle with the spring of the table of muscles."""
+    """Bend a joint by a box; compare moment over angle with the table's spring, and under pd the tissue beside it."""
     velocity = [LIFT_SPEED * part for part in lift.direction]
     box = {"name": "box", "kind": "box", "size": list(lift.half), "position": list(lift.center)}
     scene = {"ground": False, "colliders": [box | {"velocity": velocity, "friction": 0.0}]}
@@ -61,6 +62,8 @@ def stiffness(options: Options, control: str, lift: Lift) -> Iterator[Quantity]:
     about = moment - np.cross(probe.pose[1][joint_index(lift.joint)], force)
     angle = float(np.linalg.norm(probe.errors[joint_index(lift.joint)]))
     wanted = probe.spring(lift.joint)
+    if control == "pd":
+        wanted = float(np.linalg.norm(joint_moment(probe, lift.joint))) / max(angle, 1e-6)
     measured = float(np.linalg.norm(about)) / max(angle, 1e-6)
     yield equal(f"stiffness of the {lift.joint.removeprefix('left_')}", measured, wanted, 0.1 * wanted, "N m/rad")
 
@@ -81,34 +84,36 @@ def moment_about(probe: Probe, joint: str, force: np.ndarray) -> np.ndarray:
     return np.cross(probe.x[probe.body] - probe.pose[1][joint_index(joint)], share * force).sum(0)
 
 
-def spring_moment(probe: Probe, joint: str) -> np.ndarray:
-    """Return the moment [N m] of the spring of a joint on what is beyond it, in the world, for small errors."""
+def joint_moment(probe: Probe, joint: str) -> np.ndarray:
+    """Return the moment [N m] of a joint's spring and tissue on what is beyond it, in the world, for small errors."""
     index = joint_index(joint)
     goal = Rotation.from_quat(probe.simulation.avatar.state.goal_rotation.numpy()[0, index].astype(float))
-    return -probe.spring(joint) * probe.pose[0][PARENTS[index]] @ goal.apply(probe.errors[index])
+    spring = -probe.spring(joint) * goal.apply(probe.errors[index])
+    bend = probe.local * (np.arange(len(JOINT_NAMES)) > 0)[:, None]
+    return probe.pose[0][PARENTS[index]] @ (spring + probe.tissue.torque(bend[None])[0, index])
 
 
 @check("springs_weight", "held body hangs its limbs under gravity (pd)")
 def springs_weight(options: Options) -> Iterator[Quantity]:
-    """Compare the moment of each joint's spring with that of the weight beyond it."""
+    """Compare the moment of each joint's spring and tissue with that of the weight beyond it."""
     probe = Probe.under(options, "pd", scene={"ground": False})
     probe.run(SETTLING)
     weight = probe.mass[probe.body, None] * [0.0, 0.0, -GRAVITY]
     joints = [name for name in JOINT_NAMES[1:] if not name.endswith("foot")]
-    left = [np.linalg.norm(moment_about(probe, name, weight) + spring_moment(probe, name)) for name in joints]
+    left = [np.linalg.norm(moment_about(probe, name, weight) + joint_moment(probe, name)) for name in joints]
     yield at_most("largest sum of spring's and weight's moment", max(left), 0.02, "N m", theory=0.0)
 
 
 @check("force_foot", "20 N lift a foot of a held, weightless body (pd)")
 def force_foot(options: Options) -> Iterator[Quantity]:
-    """Compare the moments of the ankle's, the knee's and the hip's springs with the force times its arm."""
+    """Compare the moments of the ankle's, the knee's and the hip's springs and tissue with the force times its arm."""
     probe, force = Probe.under(options, "pd", **EMPTY), np.array([0.0, 0.0, 20.0])
     foot = probe.particles_of("left_ankle", "left_foot")
     at = push(probe, "left_ankle", force, SETTLING, probe.mass[foot] @ probe.x[foot] / probe.mass[foot].sum())
     for name in ("left_ankle", "left_knee", "left_hip"):
         theory = -np.cross(at(probe) - probe.pose[1][joint_index(name)], force)[0]
         label = f"moment of the {name.removeprefix('left_')}'s spring about x"
-        yield equal(label, spring_moment(probe, name)[0], theory, max(0.02, 0.02 * abs(theory)), "N m")
+        yield equal(label, joint_moment(probe, name)[0], theory, max(0.02, 0.02 * abs(theory)), "N m")
 
 
 @check("force_hand", "20 N pull a hand of a held, weightless body down (pose)")
@@ -149,8 +154,8 @@ def push(
 def rigid_response(probe: Probe, bone: str, impulse: np.ndarray, at: np.ndarray, seconds: float) -> np.ndarray:
     """Return how far the joints of an articulated body at rest turn in some time after an impulse [rad], ``(22, 3)``.
 
-    Flesh moves as it is skinned to the bones; toes are part of the feet. Joints have the damping of their tissue, and
-    turn little: ``M a = -D v`` with the mass matrix ``M`` of the pose.
+    Flesh moves as it is skinned to the bones; toes are part of the feet. Joints turn little, against their tissue:
+    ``M a = -(D + tau K) v - K q`` with the mass matrix ``M`` and the stiffness ``K`` of the rest pose.
     """
     x, position, joints = probe.x[probe.body], probe.pose[1], range(len(JOINT_NAMES))
     below = [beyond(name) for name in JOINT_NAMES]
@@ -169,12 +174,18 @@ def rigid_response(probe: Probe, bone: str, impulse: np.ndarray, at: np.ndarray,
         found = sum(shares[index] * jacobian(place, index) for index in np.flatnonzero(shares))
         inertia += mass * found.T @ found
     moving = np.diagonal(inertia) > 1e-12
-    damping = np.r_[np.zeros(6), np.repeat(make_muscles().tissue_damping[1:], 3)][moving]
+    bends, slight = np.eye(size - 3).reshape(-1, len(JOINT_NAMES), 3), 1.0e-4
+    pulls = probe.tissue.pull(-slight * bends)[0] - probe.tissue.pull(slight * bends)[0]
+    stiff = np.zeros((size, size))
+    stiff[6:, 6:] = pulls.reshape(len(bends), -1)[3:, 3:] / (2.0 * slight)
+    stiff = stiff[np.ix_(moving, moving)]
+    own = np.r_[np.zeros(6), np.repeat(probe.size * make_muscles().tissue_damping[1:], 3)][moving]
+    damping = np.diag(own) + float(RETARDATION_TIME) * stiff
     rate = np.linalg.solve(inertia[np.ix_(moving, moving)], (jacobian(at, joint_index(bone)).T @ impulse)[moving])
     dt, turned = seconds / SAMPLES, np.zeros(len(rate))
-    implicit = np.linalg.inv(inertia[np.ix_(moving, moving)] + dt * np.diag(damping))
+    implicit = np.linalg.inv(inertia[np.ix_(moving, moving)] + dt * damping + dt**2 * stiff)
     for _ in range(SAMPLES):
-        rate = implicit @ (inertia[np.ix_(moving, moving)] @ rate)
+        rate = implicit @ (inertia[np.ix_(moving, moving)] @ rate - dt * stiff @ turned)
         turned += dt * rate
     found = np.zeros(size)
     found[moving] = turned

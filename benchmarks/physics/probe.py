@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from agents.pid.tissue import Tissue
 from benchmarks.physics.checks import Options, SimulationFailed
 from piavatar_envs.api.gym_env import AvatarEnv
 from piavatar_envs.avatar.body.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, make_muscles
@@ -177,6 +178,11 @@ class Measurements:
     def spring(self, joint: str) -> float:
         """Return the stiffness of a joint of this body by the table of muscles [N m/rad]."""
         return float(self.size * make_muscles().stiffness[joint_index(joint)])
+
+    @cached_property
+    def tissue(self) -> Tissue:
+        """Tissue of the joints of this body."""
+        return Tissue(self.size, self.simulation.flesh[0].torque_control().flesh_stiffness)
 
     def sensor(self, name: str) -> np.ndarray:
         """Return a contact sensor of the last control step."""
