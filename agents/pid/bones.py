@@ -14,21 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from piavatar_envs.avatar.body.device import BodyPoints
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
+from piavatar_envs.avatar.body.skeleton import BEYOND, NUM_JOINTS, forward_kinematics
 
 NUM_DOF = 3 + 3 * NUM_JOINTS
-
-
-def _beyond() -> np.ndarray:
-    """Return whether a bone is moved by a joint; ``(joint, bone)``."""
-    beyond = np.eye(NUM_JOINTS, dtype=bool)
-    for joint in range(NUM_JOINTS - 1, 0, -1):
-        beyond[PARENTS[joint]] |= beyond[joint]
-    return beyond
-
-
-#: Whether a bone hangs on a joint, or is what it moves; ``(joint, bone)``.
-BEYOND = _beyond()
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.physics.checks import Options, Quantity, at_most, check, equal
-from benchmarks.physics.probe import EMPTY, GRAVITY, Probe, beyond
+from benchmarks.physics.probe import EMPTY, GRAVITY, Probe
 from piavatar_envs.avatar.body.muscles import LOCKED_JOINTS, make_muscles
-from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
+from piavatar_envs.avatar.body.skeleton import BEYOND, JOINT_NAMES, PARENTS, joint_index
 from piavatar_envs.avatar.torque_control.joint_tissue import RETARDATION_TIME
 
 LIFT_SPEED = 0.05  # of a box that rises against a limb [m/s]
@@ -80,7 +80,7 @@ _register_lifts()
 
 def moment_about(probe: Probe, joint: str, force: np.ndarray) -> np.ndarray:
     """Return the moment [N m] about a joint of forces on the particles beyond it, shape ``(P, 3)`` [N]."""
-    share = probe.shares[:, beyond(joint)].sum(1, keepdims=True)
+    share = probe.shares[:, BEYOND[joint_index(joint)]].sum(1, keepdims=True)
     return np.cross(probe.x[probe.body] - probe.pose[1][joint_index(joint)], share * force).sum(0)
 
 
@@ -158,14 +158,13 @@ def rigid_response(probe: Probe, bone: str, impulse: np.ndarray, at: np.ndarray,
     ``M a = -(D + tau K) v - K q`` with the mass matrix ``M`` and the stiffness ``K`` of the rest pose.
     """
     x, position, joints = probe.x[probe.body], probe.pose[1], range(len(JOINT_NAMES))
-    below = [beyond(name) for name in JOINT_NAMES]
     size = 3 + 3 * len(JOINT_NAMES)
 
     def jacobian(place: np.ndarray, index: int) -> np.ndarray:
         found = np.zeros((3, size))
         found[:, :3] = np.eye(3)
         for b in joints:
-            if index in below[b] and JOINT_NAMES[b] not in LOCKED_JOINTS:
+            if BEYOND[b, index] and JOINT_NAMES[b] not in LOCKED_JOINTS:
                 found[:, 3 + 3 * b : 6 + 3 * b] = np.cross(np.eye(3), place - position[b]).T
         return found
 

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 from agents.pid.tissue import Tissue
 from benchmarks.physics.checks import Options, SimulationFailed
 from piavatar_envs.api.gym_env import AvatarEnv
+from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, make_muscles
-from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index, skin
+from piavatar_envs.avatar.body.skeleton import joint_index, skin
 from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.sim.world import Simulation
@@ -143,9 +144,7 @@ class Measurements:
     @cached_property
     def shares(self) -> np.ndarray:
         """Skinning weight of every bone on each particle of the avatar, shape ``(P, 22)``."""
-        points, shares = self.points, np.zeros((self.body.stop, len(JOINT_NAMES)))
-        rows = np.arange(self.body.stop)[:, None]
-        np.add.at(shares, (rows, points.skin_joints), points.skin_weights)
+        shares = dense_weights(self.points.skin_joints, self.points.skin_weights)
         return shares / shares.sum(1, keepdims=True)
 
     @cached_property
@@ -277,12 +276,3 @@ def ball(mass: float, speed: float, at: Sequence[float], distance: float = 0.45,
     """Return a ball of 22 cm that flies at the front of the body at ``at`` (x, z) [m]."""
     place, velocity = [at[0], -distance, at[1]], [0.0, speed, 0.0]
     return {"name": "ball", "mass": mass, "size": [0.11], "position": place, "velocity": velocity, **more}
-
-
-def beyond(joint: str) -> list[int]:
-    """Return the joint and all joints below it in the tree."""
-    found = [joint_index(joint)]
-    for child in range(found[0] + 1, len(PARENTS)):
-        if PARENTS[child] in found:
-            found.append(child)
-    return found

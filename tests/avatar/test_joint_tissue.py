@@ -7,7 +7,8 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.flesh_stiffness import flesh_stiffness, rest_gradient
+from piavatar_envs.avatar.body.flesh_stiffness import flesh_stiffness
+from piavatar_envs.avatar.body.interpolation import rest_gradient
 from piavatar_envs.avatar.body.passive import passive_moments
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, forward_kinematics, joint_index, joint_limits, skin
@@ -126,9 +127,9 @@ def strained_energy(body, rotvec: np.ndarray) -> float:
     rest, joints = p.rest_positions.astype(float), asset.joints.astype(float)
     pose = forward_kinematics(Rotation.from_rotvec(rotvec).as_matrix(), joints[0], joints)
     x = skin(rest, p.skin_joints, p.skin_weights.astype(float), *pose, joints)
-    F = np.stack([along @ x for along in rest_gradient(rest, p.links)], axis=-1)
+    F = np.stack([along @ x for along in rest_gradient(rest, p.links)[0]], axis=-1)
     known = (
-        np.abs(np.stack([along @ rest for along in rest_gradient(rest, p.links)], -1) - np.eye(3)).max((1, 2)) < 1e-6
+        np.abs(np.stack([along @ rest for along in rest_gradient(rest, p.links)[0]], -1) - np.eye(3)).max((1, 2)) < 1e-6
     )
     J = np.linalg.det(F[known])
     density = 0.5 * MU * ((F[known] ** 2).sum((1, 2)) - 3.0) - MU * np.log(J) + 0.5 * LAM * np.log(J) ** 2

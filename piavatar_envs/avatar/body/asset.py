@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
 
 NUM_SKIN_JOINTS = 4
 SAMPLE_DEVIATION = 0.4  # standard deviation of a sampled shape parameter, before the clip to [-1, 1]
@@ -158,3 +158,11 @@ def dense_weights(skin_joints: np.ndarray, skin_weights: np.ndarray, num_joints:
     dense = np.zeros((len(skin_joints), num_joints))
     np.add.at(dense, (np.arange(len(skin_joints))[:, None], skin_joints), skin_weights)
     return dense
+
+
+def turned_shares(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """Return the sum of the weights of all bones that a joint turns, shape ``(N, 22)`` float64."""
+    shares = dense_weights(skin_joints, skin_weights)
+    for bone in range(NUM_JOINTS - 1, 0, -1):  # children come after their parents
+        shares[:, PARENTS[bone]] += shares[:, bone]
+    return shares

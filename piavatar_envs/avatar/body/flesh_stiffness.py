@@ -19,40 +19,14 @@ held and all others free, linear elasticity leaves 0.08 to 0.44 of that energy, 
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 
-from piavatar_envs.avatar.body.asset import dense_weights
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.body.asset import turned_shares
+from piavatar_envs.avatar.body.interpolation import rest_gradient
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 
 #: Energy of flesh that is free to give way over that of flesh held at its skinned places [-].
 FREE_SHARE = 0.25
-#: Least ``det(K) / (tr(K) / 3)^3`` of ``K = sum dX dX^T``: neighbours in a plane or on a line fix no gradient.
-_LEAST_SPREAD = 0.05
 _EPSILON = np.cross(np.eye(3)[:, None], np.eye(3)[None])  # (a, r, i): a x r
-
-
-def rest_gradient(rest: np.ndarray, links: np.ndarray) -> list[sparse.csr_matrix]:
-    """Return the operators that give the gradient of a field at all particles along x, y and z, each ``(P, P)`` [1/m].
-
-    Args:
-        rest: rest positions [m], shape ``(P, 3)``.
-        links: pairs of neighbours, shape ``(L, 2)``.
-    """
-    count = len(rest)
-    own, other = np.concatenate([links, links[:, ::-1]]).T
-    apart = rest[other] - rest[own]
-    spread = np.zeros((count, 9))
-    for k, product in enumerate((apart[:, :, None] * apart[:, None]).reshape(-1, 9).T):
-        spread[:, k] = np.bincount(own, product, count)
-    spread = spread.reshape(-1, 3, 3)
-    size = np.trace(spread, axis1=1, axis2=2) / 3.0
-    known = np.linalg.det(spread) > _LEAST_SPREAD * size**3
-    inverse = np.zeros_like(spread)
-    inverse[known] = np.linalg.inv(spread[known])
-    weight = np.einsum("li,lij->lj", apart, inverse[own])
-    rows, columns = np.r_[own, own], np.r_[other, own]
-    shape = (count, count)
-    return [sparse.csr_matrix((np.r_[weight[:, k], -weight[:, k]], (rows, columns)), shape=shape) for k in range(3)]
 
 
 def flesh_stiffness(
@@ -77,12 +51,10 @@ def flesh_stiffness(
         mu: shear modulus [Pa], shape ``(P,)``.
         lam: Lame's first parameter [Pa], shape ``(P,)``.
     """
-    share = dense_weights(skin_joints, skin_weights).astype(float)
-    for bone in range(NUM_JOINTS - 1, 0, -1):
-        share[:, PARENTS[bone]] += share[:, bone]
+    share = turned_shares(skin_joints, skin_weights)
     moves = share.T[:, None, :, None] * np.einsum("arj,cpr->capj", _EPSILON, rest - joints[:, None])
     fields = moves.reshape(3 * NUM_JOINTS, -1, 3).transpose(1, 0, 2).reshape(len(rest), -1)
-    gradient = np.stack([along @ fields for along in rest_gradient(rest, links)], axis=-1)
+    gradient = np.stack([along @ fields for along in rest_gradient(rest, links)[0]], axis=-1)
     gradient = gradient.reshape(len(rest), 3 * NUM_JOINTS, 3, 3).swapaxes(0, 1)
     gradient[:3] = 0.0  # of the pelvis, with which the whole body turns
     strains = 0.5 * (gradient + gradient.swapaxes(2, 3))

@@ -1,4 +1,4 @@
-"""Interpolation of quantities of particles at other points of a body, without glueing limbs that touch."""
+"""Interpolation of quantities of particles at other points of a body, without glueing limbs that touch; gradients."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from scipy.spatial import cKDTree
 _CANDIDATES = (64, 256)
 #: A particle with less than this share of the best candidate's overlap moves with other bones: leave it out.
 _MIN_RELATIVE_OVERLAP = 0.05
+#: Least ``det(K) / (tr(K) / 3)^3`` of ``K = sum dX dX^T``: neighbours in a plane or on a line fix no gradient.
+_LEAST_SPREAD = 0.05
 
 
 def interpolation_matrix(
@@ -60,3 +62,31 @@ def _select(
     weights = overlap * (1.0 - np.minimum(distance / support, 1.0) ** 2) ** 2
     weights, index = weights[:, :num_neighbours], index[:, :num_neighbours]
     return index, weights / weights.sum(axis=1, keepdims=True)
+
+
+def rest_gradient(rest: np.ndarray, links: np.ndarray) -> tuple[list[sparse.csr_matrix], np.ndarray]:
+    """Return the operators that give the gradient of a field at all particles, by moving least squares.
+
+    Args:
+        rest: rest positions [m], shape ``(P, 3)``.
+        links: pairs of neighbours, shape ``(L, 2)``.
+
+    Returns:
+        Derivatives along x, y and z, each ``(P, P)`` [1/m], zero where neighbours fix no gradient; and where they do,
+        ``(P,)`` bool.
+    """
+    count = len(rest)
+    own, other = np.concatenate([links, links[:, ::-1]]).T
+    apart = rest[other] - rest[own]
+    products = (apart[:, :, None] * apart[:, None]).reshape(-1, 9).T
+    spread = np.stack([np.bincount(own, product, count) for product in products], axis=1).reshape(-1, 3, 3)
+    size = np.trace(spread, axis1=1, axis2=2) / 3.0
+    known = np.linalg.det(spread) > _LEAST_SPREAD * size**3
+    inverse = np.zeros_like(spread)
+    inverse[known] = np.linalg.inv(spread[known])
+    weight = np.einsum("li,lij->lj", apart, inverse[own])
+    rows, columns = np.r_[own, own], np.r_[other, own]
+    along = [
+        sparse.csr_matrix((np.r_[weight[:, k], -weight[:, k]], (rows, columns)), shape=(count, count)) for k in range(3)
+    ]
+    return along, known

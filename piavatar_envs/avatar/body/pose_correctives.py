@@ -32,10 +32,10 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights
-from piavatar_envs.avatar.body.interpolation import interpolation_matrix
+from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, turned_shares
+from piavatar_envs.avatar.body.interpolation import interpolation_matrix, rest_gradient
 from piavatar_envs.avatar.body.sampling import ParticleSet, sample_particles, spacing_for
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.body.skeleton import BEYOND, NUM_JOINTS
 
 #: Angle from which the coefficients are taken, to either side [rad].
 ANGLE = np.radians(40.0)
@@ -53,8 +53,6 @@ NEIGHBOURS = 8
 CELLS_PER_HEIGHT = 32
 #: Largest spacing of particles over the body's height that resolves how flesh makes way; coarser bodies get none.
 COARSEST = 0.03
-#: Least ``det(K) / (tr(K) / 3)^3`` of ``K = sum dX dX^T``: neighbours in a plane or on a line fix no gradient.
-_LEAST_SPREAD = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +119,9 @@ def fit_correctives(particles: ParticleSet, joints: np.ndarray) -> np.ndarray:
     """
     rest, weights = particles.rest_positions.astype(float), particles.skin_weights.astype(float)
     weights /= weights.sum(axis=1, keepdims=True)
-    along, known = _gradients(rest, particles.links)
+    along, known = rest_gradient(rest, particles.links)
     project = _projection(along, _yields(particles))
-    share = dense_weights(particles.skin_joints, particles.skin_weights).astype(float)
-    for bone in range(NUM_JOINTS - 1, 0, -1):
-        share[:, PARENTS[bone]] += share[:, bone]
+    share = turned_shares(particles.skin_joints, particles.skin_weights)
     fitted = np.zeros((NUM_JOINTS, len(rest), 3, 6))
     for joint in range(1, NUM_JOINTS):
         # elsewhere this joint moves a particle with all its neighbours rigidly
@@ -159,40 +155,11 @@ def _volume_ratio(
     rows: list[sparse.csr_matrix],
 ) -> np.ndarray:
     """Return ``J`` of the skinning with one ``joint`` turned by a rotation vector, at the particles of ``rows``."""
-    moved = _beyond(joint)[particles.skin_joints]
+    moved = BEYOND[joint, particles.skin_joints]
     share = (weights * moved).sum(axis=1)[:, None]
     matrix = Rotation.from_rotvec(turn).as_matrix()
     place = rest + share * ((rest - joints[joint]) @ (matrix - np.eye(3)).T)
     return np.linalg.det(np.stack([own @ place for own in rows], axis=-1))
-
-
-@lru_cache(maxsize=NUM_JOINTS)
-def _beyond(joint: int) -> np.ndarray:
-    """Return the flags of the bones that a joint turns, shape ``(22,)`` float."""
-    flags = np.zeros(NUM_JOINTS)
-    flags[joint] = 1.0
-    for bone in range(joint + 1, NUM_JOINTS):
-        flags[bone] = flags[PARENTS[bone]]
-    return flags
-
-
-def _gradients(rest: np.ndarray, links: np.ndarray) -> tuple[list[sparse.csr_matrix], np.ndarray]:
-    """Return the operators of derivatives along x, y and z ``(P, P)`` [1/m], and where they exist, ``(P,)`` bool."""
-    count = len(rest)
-    own, other = np.concatenate([links, links[:, ::-1]]).T
-    apart = rest[other] - rest[own]
-    products = (apart[:, :, None] * apart[:, None]).reshape(-1, 9).T
-    spread = np.stack([np.bincount(own, product, count) for product in products], axis=1).reshape(-1, 3, 3)
-    size = np.trace(spread, axis1=1, axis2=2) / 3.0
-    known = np.linalg.det(spread) > _LEAST_SPREAD * size**3
-    inverse = np.zeros_like(spread)
-    inverse[known] = np.linalg.inv(spread[known])
-    weight = np.einsum("li,lij->lj", apart, inverse[own])
-    rows, columns = np.r_[own, own], np.r_[other, own]
-    operators = [
-        sparse.csr_matrix((np.r_[weight[:, k], -weight[:, k]], (rows, columns)), shape=(count, count)) for k in range(3)
-    ]
-    return operators, known
 
 
 def _projection(along: list[sparse.csr_matrix], free: np.ndarray):

@@ -54,6 +54,19 @@ PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13
 NUM_JOINTS = len(JOINT_NAMES)
 NUM_ACTUATED = NUM_JOINTS - 1  # every joint but the root
 
+
+def _beyond() -> np.ndarray:
+    """Return whether a bone is moved by a joint; ``(joint, bone)``."""
+    beyond = np.eye(NUM_JOINTS, dtype=bool)
+    for joint in range(NUM_JOINTS - 1, 0, -1):
+        beyond[PARENTS[joint]] |= beyond[joint]
+    beyond.setflags(write=False)
+    return beyond
+
+
+#: Whether a bone hangs on a joint, or is what it moves; ``(joint, bone)``.
+BEYOND = _beyond()
+
 #: Coarse regions of the body for sensors and metrics: name -> joints.
 BODY_PARTS: dict[str, tuple[str, ...]] = {
     "head": ("neck", "head"),
