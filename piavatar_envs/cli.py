@@ -23,6 +23,7 @@ EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="a
 AgentName = Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")]
 Seed = Annotated[int, tyro.conf.arg(help="of the first reset and of the random actions")]
 Device = Annotated[str, tyro.conf.arg(help="where to simulate: cpu, cuda, cuda:1, ...")]
+AvatarFile = Annotated[Path | None, tyro.conf.arg(help="file of a character; its ending chooses avatar.source")]
 Overrides = Annotated[
     tuple[str, ...], tyro.conf.arg(aliases=["-c"], help="settings, e.g. -c fidelity=tiny control.tone=0")
 ]
@@ -68,6 +69,7 @@ def play_command(
     seed: Seed = 0,
     device: Device = "cpu",
     color: Annotated[Literal["skin", "strain"], tyro.conf.arg(help="colour of the body in the video")] = "skin",
+    avatar: AvatarFile = None,
     config: Overrides = (),
 ) -> None:
     """Play an environment, print its return and metrics, and write a video if given a file.
@@ -80,11 +82,12 @@ def play_command(
         seed: seed of the run.
         device: where to simulate.
         color: skin or strain.
+        avatar: the body, instead of the package's own.
         config: overrides of the environment's configuration.
     """
     from piavatar_envs import play
 
-    overrides = prepare(env_id, config)
+    overrides = prepare(env_id, config, avatar)
     play.show(play.play(env_id, agent, video, steps, seed, device, color, overrides), video)
 
 
@@ -94,6 +97,7 @@ def watch_command(
     seed: Seed = 0,
     device: Device = "cpu",
     port: Annotated[int, tyro.conf.arg(help="of this machine, or the next one that is free")] = 8080,
+    avatar: AvatarFile = None,
     config: Overrides = (),
 ) -> None:
     """Play an environment for ever, live in a web browser, until Ctrl-C (needs the extra live).
@@ -104,25 +108,33 @@ def watch_command(
         seed: seed of the run.
         device: where to simulate.
         port: of the view.
+        avatar: the body, instead of the package's own.
         config: overrides of the environment's configuration.
     """
     from piavatar_envs import watch
 
-    watch.watch(env_id, agent, seed, device, port, prepare(env_id, config))
+    watch.watch(env_id, agent, seed, device, port, prepare(env_id, config, avatar))
 
 
-def prepare(env_id: str, config: tuple[str, ...]) -> dict[str, Any]:
-    """Check the id, silence Warp, and return the settings.
+def prepare(env_id: str, config: tuple[str, ...], avatar: Path | None = None) -> dict[str, Any]:
+    """Check the id, silence Warp, and return the settings, with those of the source of a character's file.
 
     Raises:
         ImportError: there is no such module.
-        ValueError: there is no such environment, or an assignment is not a setting.
+        FileNotFoundError: there is no such file.
+        ValueError: there is no such environment, an assignment is not a setting, or no source reads the file.
     """
     from piavatar_envs import doctor
     from piavatar_envs.config import parse_assignments
 
     check_id(env_id)
     overrides = parse_assignments(config)
+    if avatar is not None:
+        from piavatar_envs.avatar.body.sources import source_of
+
+        if not avatar.exists():
+            raise FileNotFoundError(f"there is no file {avatar}")
+        overrides = {"avatar.source": source_of(avatar), "avatar.path": str(avatar), **overrides}
     doctor.quiet_warp()
     return overrides
 

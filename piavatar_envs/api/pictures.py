@@ -102,10 +102,10 @@ class SceneReader:
         key = (avatar, flesh.shape_parameters[env].tobytes())
         if key not in self._skins:
             points, row = flesh.points, min(env, len(flesh.points.rest) - 1)
-            shaped = flesh.asset.shape(flesh.shape_parameters[env])
+            shaped = flesh.asset.shape_drawn(flesh.shape_parameters[env])
             self._skins = {other: skin for other, skin in self._skins.items() if other[0] != avatar}
             self._skins[key] = Skin.baked(
-                flesh.asset, shaped, points.rest[row], points.skin_joints, points.skin_weights
+                flesh.asset.drawn, shaped, points.rest[row], points.skin_joints, points.skin_weights
             )
         return self._skins[key]
 
@@ -123,7 +123,8 @@ class SceneReader:
             if color == "strain":
                 F = matrices_of(simulation.state.F.numpy()[env])
                 scalars = skin.interpolate(strain_magnitude(F[own]))
-            bodies.append(Body(vertices, flesh.asset.faces, color=PALETTE[index % len(PALETTE)], scalars=scalars))
+            drawn, color_of_all = flesh.asset.drawn, PALETTE[index % len(PALETTE)]
+            bodies.append(Body(vertices, drawn.faces, color_of_all, drawn.colors, scalars=scalars))
         return bodies
 
     def _props(self, env: int, x: np.ndarray) -> list[Body]:

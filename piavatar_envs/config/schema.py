@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from piavatar_envs.avatar.body.flesh_stiffness import FREE_SHARE
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
-from piavatar_envs.avatar.body.sources import check_source
+from piavatar_envs.avatar.body.sources import check_settings, check_source
 from piavatar_envs.config.load import ConfigError, load_config
 from piavatar_envs.mpm.materials import check_material
 from piavatar_envs.mpm.model import CFL_STABLE
@@ -291,15 +291,32 @@ class TorqueControlConfig(BaseModel):
 ControlConfig = Annotated[PoseControlConfig | TorqueControlConfig, Field(discriminator="mode")]
 
 
-class AvatarSourceConfig(BaseModel):
-    """The source of the body; see :mod:`piavatar_envs.avatar.body.sources`."""
+#: Value of a setting of an avatar source.
+SourceValue = bool | int | float | str | tuple[bool | int | float | str, ...] | None
 
-    model_config = FROZEN
+
+class AvatarSourceConfig(BaseModel):
+    """The source of the body and its own settings; see :mod:`piavatar_envs.avatar.body.sources` and docs/avatars.md."""
+
+    model_config = FROZEN | {"extra": "allow"}
+    __pydantic_extra__: dict[str, SourceValue]
 
     source: Annotated[str, AfterValidator(check_source)] = Field(
-        "embedded", description="embedded (the body of this package), or a source of your own by its name"
+        "embedded",
+        description="embedded (the body of this package), another source of docs/avatars.md, or one of your own, by "
+        "its name; further settings below avatar are those of the source",
     )
     path: str | None = Field(None, description="file or folder of the body, for sources that read one")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The source's own settings."""
+        given = {"path": self.path, **(self.__pydantic_extra__ or {})}
+        return {name: value for name, value in given.items() if value is not None}
+
+    def of_avatar(self, own: Mapping[str, Any]) -> AvatarSourceConfig:
+        """Return the source of an avatar with settings of its own; those that name a source replace all of these."""
+        return load_config(AvatarSourceConfig, None if "source" in own else self, own)
 
 
 class ShapeConfig(BaseModel):
@@ -640,6 +657,19 @@ class EnvConfig(BaseModel):
         """Refuse an avatar's settings of another mode than the environment's."""
         for index, avatar in enumerate(self.scene.avatars):
             _check_control(self.control.mode, avatar.control, f"scene.avatars.{index}.")
+        return self
+
+    @model_validator(mode="after")
+    def _check_sources(self) -> EnvConfig:
+        """Refuse settings that the source of a body does not have."""
+        places = {"avatar": self.avatar}
+        for index, avatar in enumerate(self.scene.avatars):
+            places[f"scene.avatars.{index}.avatar"] = self.avatar.of_avatar(avatar.avatar)
+        for key, chosen in places.items():
+            try:
+                check_settings(chosen.source, chosen.settings)
+            except ValueError as error:
+                raise ConfigError(f"{key}: {error}") from None
         return self
 
 

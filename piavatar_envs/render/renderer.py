@@ -164,6 +164,10 @@ def _open(backend: str, width: int, height: int) -> Backend:
 
 
 def _body_colors(body: Body) -> np.ndarray:
+    if body.scalars is None and body.colors is not None:
+        if np.shape(body.colors) != (len(body.vertices), 3):
+            raise ValueError(f"colors have shape {np.shape(body.colors)}; give a row a vertex: {len(body.vertices)}")
+        return body.colors / np.float32(255.0)
     if body.scalars is None:
         return np.broadcast_to(body.color, (len(body.vertices), 3))
     if np.shape(body.scalars) != (len(body.vertices),):

@@ -31,6 +31,7 @@ class Body:
         vertices: positions [m], shape ``(V, 3)``.
         faces: outward oriented triangles, shape ``(T, 3)`` int. Pass the same array every frame.
         color: sRGB in [0, 1].
+        colors: sRGB of the vertices instead, shape ``(V, 3)`` uint8. Pass the same array every frame.
         scalars: what to colour by instead, shape ``(V,)``, for example the strain.
         scalar_max: the value of the last colour; the range is ``[0, scalar_max]``, the same in every frame.
         scalar_label: title of the colour scale.
@@ -39,6 +40,7 @@ class Body:
     vertices: np.ndarray
     faces: np.ndarray
     color: Color = CLAY
+    colors: np.ndarray | None = None
     scalars: np.ndarray | None = None
     scalar_max: float = 0.3
     scalar_label: str = "max |stretch - 1|"

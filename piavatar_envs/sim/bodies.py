@@ -327,7 +327,7 @@ def load_avatar(settings: AvatarSourceConfig) -> AvatarAsset:
         ConfigError: the source refuses the settings, or finds no file.
     """
     try:
-        return load_asset(settings.source, settings.path)
+        return load_asset(settings.source, **settings.settings)
     except (OSError, TypeError, ValueError) as error:
         raise ConfigError(f"avatar: {error}") from None
 

@@ -17,7 +17,7 @@ from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.controller import Controller
 from piavatar_envs.avatar.pose_control.controller import PoseController
 from piavatar_envs.avatar.torque_control.controller import TorqueController
-from piavatar_envs.config import AvatarConfig, EnvConfig, SceneConfig, replace
+from piavatar_envs.config import AvatarConfig, EnvConfig, SceneConfig
 from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_colliders
@@ -121,7 +121,7 @@ class Simulation:
         """Load the body of every avatar; the height of the first sets the grid spacing."""
         config = self.config
         self._avatar_configs = self.scene.avatars or (AvatarConfig(),)
-        self._assets = [asset or load_avatar(replace(config.avatar, own.avatar)) for own in self._avatar_configs]
+        self._assets = [asset or load_avatar(config.avatar.of_avatar(own.avatar)) for own in self._avatar_configs]
         self.asset = self._assets[0]
         self.dx = float(np.ptp(self.asset.mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[config.physics.fidelity]
 

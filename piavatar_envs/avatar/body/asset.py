@@ -27,6 +27,27 @@ class ShapedBody:
 
 
 @dataclass(frozen=True, eq=False)
+class Look:
+    """A surface that is drawn in place of the skin, such as a clothed character; it has no part in the simulation.
+
+    Attributes:
+        vertices: of the mean shape, in the frame of the skin's [m], shape ``(W, 3)`` float32.
+        faces: triangles, shape ``(U, 3)`` int32; only their fronts are drawn.
+        skin_joints: joints that move each vertex, shape ``(W, 4)`` int32.
+        skin_weights: their weights, descending, rows sum to one, shape ``(W, 4)`` float32.
+        colors: sRGB of the vertices, shape ``(W, 3)`` uint8, or None for the one colour of the avatar.
+        shape_deltas: displacements as those of the skin [m], shape ``(S, 2, W, 3)`` float32.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+    colors: np.ndarray | None
+    shape_deltas: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class AvatarAsset:
     """A skinned, shapeable body. Axes: metres, z up, facing -y, its left is +x; joints as in ``skeleton.py``.
 
@@ -43,6 +64,7 @@ class AvatarAsset:
         shape_names: names of the ``S`` shape parameters.
         shape_deltas: vertex displacements at -1 and at +1 of each parameter [m], shape ``(S, 2, V, 3)`` float32.
         shape_joints: joint displacements, the same way [m], shape ``(S, 2, 22, 3)`` float32.
+        look: the surface to draw; None draws the skin.
     """
 
     name: str
@@ -54,6 +76,7 @@ class AvatarAsset:
     shape_names: tuple[str, ...]
     shape_deltas: np.ndarray
     shape_joints: np.ndarray
+    look: Look | None = None
 
     def shape(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
         """Return the body of shape parameters ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.
@@ -61,10 +84,25 @@ class AvatarAsset:
         Raises:
             ValueError: a wrong number of parameters, or one that is not finite or outside [-1, 1].
         """
-        halves = self._halves(parameters)
-        vertices = self.vertices + np.tensordot(halves, self.shape_deltas, axes=2)
-        joints = self.joints + np.tensordot(halves, self.shape_joints, axes=2)
-        origin = np.array([joints[0, 0], joints[0, 1], vertices[:, 2].min()])
+        vertices, joints, origin = self._shaped(parameters)
+        return ShapedBody((vertices - origin).astype(np.float32), (joints - origin).astype(np.float32))
+
+    @property
+    def drawn(self) -> Look:
+        """The surface to draw: the look, or the skin in one colour."""
+        if self.look is not None:
+            return self.look
+        return Look(self.vertices, self.faces, self.skin_joints, self.skin_weights, None, self.shape_deltas)
+
+    def shape_drawn(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
+        """Return the vertices of the surface to draw and the joints, where :meth:`shape` has put the body.
+
+        Raises:
+            ValueError: as :meth:`shape`.
+        """
+        _, joints, origin = self._shaped(parameters)
+        drawn = self.drawn
+        vertices = drawn.vertices + np.tensordot(self._halves(parameters), drawn.shape_deltas, axes=2)
         return ShapedBody((vertices - origin).astype(np.float32), (joints - origin).astype(np.float32))
 
     def mean_body(self) -> ShapedBody:
@@ -115,6 +153,13 @@ class AvatarAsset:
             parameters[:, self.shape_names.index("sex")] = uniform
         parameters *= scale
         return parameters[0] if size is None else parameters
+
+    def _shaped(self, parameters: Sequence[float] | np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return skin and joints of a shape where the mean shape is, and the ground below its pelvis joint."""
+        halves = self._halves(parameters)
+        vertices = self.vertices + np.tensordot(halves, self.shape_deltas, axes=2)
+        joints = self.joints + np.tensordot(halves, self.shape_joints, axes=2)
+        return vertices, joints, np.array([joints[0, 0], joints[0, 1], vertices[:, 2].min()])
 
     def _halves(self, parameters: Sequence[float] | np.ndarray) -> np.ndarray:
         """Return factors of the negative and positive displacement fields, ``(S, 2)``; check the parameters."""

@@ -2,16 +2,20 @@
 
 A source is a function that returns an :class:`~piavatar_envs.avatar.body.asset.AvatarAsset`; its keyword arguments are
 its settings, such as the ``path`` of a file. Every module of this package is one, under its own name, by its function
-``build``; :func:`register_source` adds others. The settings ``avatar.source`` and ``avatar.path`` choose one.
+``build``; :func:`register_source` adds others. Of the settings below ``avatar``, ``source`` is its name, and the others
+are its arguments. A module may list in ``SUFFIXES`` the endings of the files that it reads.
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import os
 import pkgutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
 
@@ -21,9 +25,13 @@ Builder = Callable[..., AvatarAsset]
 _registered: dict[str, Builder] = {}
 
 
+def _own_modules() -> set[str]:
+    return {module.name for module in pkgutil.iter_modules(__path__)}
+
+
 def list_sources() -> tuple[str, ...]:
     """Return the names of all sources."""
-    return tuple(sorted({*(module.name for module in pkgutil.iter_modules(__path__)), *_registered}))
+    return tuple(sorted({*_own_modules(), *_registered}))
 
 
 def register_source(name: str, builder: Builder) -> None:
@@ -39,7 +47,7 @@ def register_source(name: str, builder: Builder) -> None:
     """
     if not callable(builder):
         raise TypeError(f"builder of {name!r} is a {type(builder).__name__}; pass a function")
-    if name in {module.name for module in pkgutil.iter_modules(__path__)}:
+    if name in _own_modules():
         raise ValueError(f"source {name!r} is one of this package; use another name")
     _registered[name] = builder
 
@@ -55,30 +63,84 @@ def check_source(name: str) -> str:
     return name
 
 
-def load_asset(source: str = "embedded", path: str | None = None) -> AvatarAsset:
-    """Return the body of a source, built once a process for equal settings.
+def source_of(path: str | Path) -> str:
+    """Return the name of the source that reads files of such a name.
+
+    Raises:
+        ValueError: none does.
+    """
+    suffix = Path(path).suffix.lower()
+    known: dict[str, str] = {}
+    for name in sorted(_own_modules()):
+        for own in getattr(importlib.import_module(f"{__name__}.{name}"), "SUFFIXES", ()):
+            known.setdefault(own, name)
+    if suffix not in known:
+        raise ValueError(f"no avatar source reads {path}; use a file of {', '.join(sorted(known))}")
+    return known[suffix]
+
+
+def check_settings(source: str, settings: Mapping[str, Any]) -> None:
+    """Refuse settings that a source does not have, and too few of them.
+
+    Raises:
+        ValueError: no source has the name, or it lacks one of the settings, or needs one that is not given.
+    """
+    parameters = inspect.signature(_builder(source)).parameters.values()
+    kinds = {parameter.kind for parameter in parameters}
+    own = [p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    unknown = [name for name in settings if name not in own]
+    if unknown and inspect.Parameter.VAR_KEYWORD not in kinds:
+        there = f"it has {', '.join(own)}" if own else "it has no settings"
+        raise ValueError(f"avatar source {source!r} has no setting {unknown[0]}={settings[unknown[0]]!r}; {there}")
+    for p in parameters:
+        if p.name in own and p.default is inspect.Parameter.empty and p.name not in settings:
+            raise ValueError(f"avatar source {source!r} needs the setting {p.name}")
+
+
+def load_asset(source: str = "embedded", path: str | Path | None = None, **settings: Any) -> AvatarAsset:
+    """Return the body of a source, built once a process for equal settings and unchanged files.
 
     Args:
         source: name of the source.
         path: a file, for sources that read one.
+        settings: other arguments of the source; those that are None are left out.
 
     Raises:
-        ValueError: no source has the name, or it takes no path, or needs one.
+        ValueError: no source has the name, or it lacks one of the settings, or needs one.
         TypeError: the source returns something else than an asset.
     """
+    given = {"path": path, **settings}
+    given = {name: _plain(value) for name, value in given.items() if value is not None}
+    check_settings(source, given)
+    versions = tuple(_version(value) for value in given.values())
+    return _build(_builder(source), tuple(sorted(given.items())), versions)
+
+
+def _builder(source: str) -> Builder:
     check_source(source)
-    builder = _registered.get(source) or importlib.import_module(f"{__name__}.{source}").build
-    settings = {} if path is None else {"path": path}
-    try:
-        inspect.signature(builder).bind(**settings)
-    except TypeError as error:
-        raise ValueError(f"avatar source {source!r} with path={path!r}: {error}") from None
-    return _build(builder, path)
+    return _registered.get(source) or importlib.import_module(f"{__name__}.{source}").build
+
+
+def _plain(value: Any) -> Any:
+    """Return a setting as a value that can be compared and hashed."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, str) or not hasattr(value, "__iter__"):
+        return value
+    return tuple(_plain(item) for item in value)
+
+
+def _version(value: Any) -> tuple[int, int] | None:
+    """Return time of change and size of the file that a setting names, so that a changed one is read anew."""
+    if not isinstance(value, str) or not os.path.isfile(value):
+        return None
+    status = os.stat(value)
+    return status.st_mtime_ns, status.st_size
 
 
 @lru_cache(maxsize=16)
-def _build(builder: Builder, path: str | None) -> AvatarAsset:
-    asset = builder() if path is None else builder(path=path)
+def _build(builder: Builder, settings: tuple[tuple[str, Any], ...], _versions: tuple) -> AvatarAsset:
+    asset = builder(**dict(settings))
     if not isinstance(asset, AvatarAsset):
         raise TypeError(f"{builder} returns a {type(asset).__name__}; return an AvatarAsset")
     return asset

@@ -1,0 +1,237 @@
+"""Characters as files have them, and the bodies that they become.
+
+A :class:`Character` is a skinned soup of surfaces in the rest pose of its file. :func:`body_of` poses it as the body of
+this package rests, closes its skin, and keeps its own surfaces as the look of the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from piavatar_envs.avatar.body.asset import AvatarAsset, Look, top_weights
+from piavatar_envs.avatar.body.closed_skin import CELL, Soup, close_skin, read_soup
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs
+
+#: Standing heights that are taken for those of a person [m].
+HEIGHTS = (0.3, 3.0)
+#: Joints that bodies without weights of their own get by interpolation point to the next one along these.
+_NEXT = {"pelvis": "spine1", "spine3": "neck"}
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Some triangles of a character.
+
+    Attributes:
+        name: in the file.
+        first: its first triangle.
+        last: the triangle after its last one.
+        material: name of its material, empty without one.
+        held: whether it is a thing on a bone, without skinning of its own, which is never body.
+    """
+
+    name: str
+    first: int
+    last: int
+    material: str = ""
+    held: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """A skinned character as read from a file, in its own rest pose. Metres, z up, facing -y, its left is +x.
+
+    Attributes:
+        name: for messages and metadata.
+        vertices: of all surfaces [m], shape ``(V, 3)`` float64.
+        faces: triangles of all surfaces, shape ``(T, 3)`` int32.
+        weights: of the joints, rows sum to one, shape ``(V, 22)`` float64.
+        joints: joint positions [m], shape ``(22, 3)`` float64.
+        colors: sRGB of the vertices, shape ``(V, 3)`` uint8.
+        surfaces: parts of ``faces``, in order.
+        shape_names: names of the ``S`` shape parameters.
+        shape_deltas: vertex displacements at -1 and at +1 of each parameter [m], shape ``(S, 2, V, 3)``.
+        shape_joints: joint displacements, the same way [m], shape ``(S, 2, 22, 3)``.
+        notes: what was guessed in reading it, such as the unit.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+    joints: np.ndarray
+    colors: np.ndarray
+    surfaces: tuple[Surface, ...]
+    shape_names: tuple[str, ...]
+    shape_deltas: np.ndarray
+    shape_joints: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def held(self) -> np.ndarray:
+        """Whether each triangle is of a thing that is held, shape ``(T,)`` bool."""
+        held = np.zeros(len(self.faces), bool)
+        for surface in self.surfaces:
+            held[surface.first : surface.last] = surface.held
+        return held
+
+
+def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
+    """Return the body of a character, and its surfaces as the look.
+
+    Args:
+        character: in any pose from which its limbs can be turned as those of the embedded body.
+        cell: spacing of the grid on which the skin is closed [m].
+
+    Raises:
+        ValueError: its height is outside :data:`HEIGHTS`, nothing encloses a volume, or arrays do not fit together.
+    """
+    _check(character)
+    soup = read_soup(character.vertices, character.faces, character.held, cell)
+    posed = to_reference_pose(with_all_joints(character))
+    skin = close_skin(soup, posed.vertices, cell)
+    weights = np.maximum(skin.anchors @ posed.weights, 0.0)
+    skin_joints, skin_weights = top_weights(weights)
+    count = len(posed.shape_names)
+    deltas = np.zeros((count, 2, len(skin.vertices), 3), np.float32)
+    for parameter, half in np.ndindex(count, 2):
+        deltas[parameter, half] = skin.anchors @ posed.shape_deltas[parameter, half]
+    return AvatarAsset(
+        name=character.name,
+        vertices=skin.vertices.astype(np.float32),
+        faces=skin.faces,
+        joints=posed.joints.astype(np.float32),
+        skin_joints=skin_joints,
+        skin_weights=skin_weights,
+        shape_names=posed.shape_names,
+        shape_deltas=deltas,
+        shape_joints=np.asarray(posed.shape_joints, np.float32).reshape(count, 2, NUM_JOINTS, 3),
+        look=_look(posed, soup),
+    )
+
+
+def to_reference_pose(character: Character) -> Character:
+    """Return the character with its limbs turned as those of the embedded body rest, by linear blend skinning.
+
+    Joint ranges, poses of agents and motions count from that pose. Down each limb the added rotation is the shortest;
+    feet stay as they are. Other shapes are turned by the same rotations.
+
+    Raises:
+        ValueError: a limb points opposite to that of the embedded body.
+    """
+    rotations = _reference_rotations(character.joints)
+    matrix = _turn(character.joints, rotations)
+    vertices = _blend(character.weights, matrix, character.vertices)
+    joints = _moved_joints(character.joints, rotations)
+    count = len(character.shape_names)
+    deltas = np.zeros((count, 2, len(vertices), 3), np.float32)
+    shape_joints = np.zeros((count, 2, NUM_JOINTS, 3))
+    for parameter, half in np.ndindex(count, 2):
+        shaped = character.joints + character.shape_joints[parameter, half]
+        points = character.vertices + character.shape_deltas[parameter, half]
+        deltas[parameter, half] = _blend(character.weights, _turn(shaped, rotations), points) - vertices
+        shape_joints[parameter, half] = _moved_joints(shaped, rotations) - joints
+    return replace(character, vertices=vertices, joints=joints, shape_deltas=deltas, shape_joints=shape_joints)
+
+
+def with_all_joints(character: Character) -> Character:
+    """Return the character with flesh on every joint: one that no vertex follows takes a share of its parent's.
+
+    Files without toes, collars or a third joint of the spine have such. The share rises along the bone, from nothing
+    a quarter of a bone before the joint to all a quarter after it.
+    """
+    weights = np.array(character.weights, np.float64)
+    for joint in range(1, NUM_JOINTS):
+        if weights[:, joint].max(initial=0.0) > 0.0:
+            continue
+        donor = PARENTS[joint]
+        children = [child for child in range(NUM_JOINTS) if PARENTS[child] == joint]
+        following = joint_index(_NEXT.get(JOINT_NAMES[joint], JOINT_NAMES[children[0]])) if children else joint
+        axis = character.joints[following] - character.joints[joint if children else donor]
+        along = (character.vertices - character.joints[joint]) @ axis / max(float(axis @ axis), 1e-12)
+        share = np.clip(0.5 + 2.0 * along, 0.0, 1.0) * weights[:, donor]
+        weights[:, joint] += share
+        weights[:, donor] -= share
+    return replace(character, weights=weights)
+
+
+def _reference_rotations(joints: np.ndarray) -> np.ndarray:
+    """Return world rotations of the bones into the reference pose, shape ``(22, 3, 3)``."""
+    from piavatar_envs.avatar.body.sources.embedded import build  # which is a source, as those that need this
+
+    reference = build().joints.astype(np.float64)
+    ends = {name: reference[joint_index(end)] - reference[joint_index(name)] for name, end in LIMB_ENDS.items()}
+    level = {"left_ankle": None, "right_ankle": None}
+    return align_limbs(joints, {**ends, **level}).as_matrix()
+
+
+def _moved_joints(joints: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return joints ``(22, 3)`` after world rotations of the bones, the pelvis in its place."""
+    local = rotations.copy()
+    for joint in range(1, NUM_JOINTS):
+        local[joint] = rotations[PARENTS[joint]].T @ rotations[joint]
+    return forward_kinematics(local, joints[0], joints)[1]
+
+
+def _turn(joints: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return the affine maps of the bones, shape ``(22, 3, 4)``."""
+    moved = _moved_joints(joints, rotations)
+    return np.concatenate([rotations, (moved - np.einsum("bij,bj->bi", rotations, joints))[..., None]], axis=2)
+
+
+def _blend(weights: np.ndarray, matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Apply linear blend skinning of all joints to points, shape ``(V, 3)`` float64."""
+    blended = (weights @ matrix.reshape(NUM_JOINTS, 12)).reshape(-1, 3, 4)
+    return np.einsum("vij,vj->vi", blended[:, :, :3], points) + blended[:, :, 3]
+
+
+def _look(posed: Character, soup: Soup) -> Look:
+    """Return the surfaces of a posed character; those that are open are drawn from both sides."""
+    faces = np.array(posed.faces, np.int32)
+    faces[soup.flipped] = faces[soup.flipped, ::-1]
+    closed = [shell.rows for shell in soup.body]
+    open_rows = np.setdiff1d(np.arange(len(faces)), np.concatenate(closed) if closed else [])
+    used, inner = np.unique(faces[open_rows], return_inverse=True)
+    inner = inner.reshape(-1, 3)[:, ::-1] + len(posed.vertices)
+    chosen = np.concatenate([np.arange(len(posed.vertices)), used])
+    skin_joints, skin_weights = top_weights(np.maximum(posed.weights, 0.0)[chosen])
+    return Look(
+        vertices=posed.vertices[chosen].astype(np.float32),
+        faces=np.concatenate([faces, inner]).astype(np.int32),
+        skin_joints=skin_joints,
+        skin_weights=skin_weights,
+        colors=np.ascontiguousarray(posed.colors[chosen], np.uint8),
+        shape_deltas=np.asarray(posed.shape_deltas, np.float32).reshape(-1, 2, len(posed.vertices), 3)[:, :, chosen],
+    )
+
+
+def _check(character: Character) -> None:
+    """Refuse arrays that do not fit together, and a body that is no person's size.
+
+    Raises:
+        ValueError: they are such.
+    """
+    count = len(character.vertices)
+    shapes: Sequence[tuple[str, np.ndarray, tuple[int, ...]]] = (
+        ("vertices", character.vertices, (count, 3)),
+        ("weights", character.weights, (count, NUM_JOINTS)),
+        ("joints", character.joints, (NUM_JOINTS, 3)),
+        ("colors", character.colors, (count, 3)),
+    )
+    for name, array, shape in shapes:
+        if np.shape(array) != shape:
+            raise ValueError(f"{character.name}: {name} have shape {np.shape(array)}, not {shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{character.name}: {name} are not all finite")
+    if len(character.faces) and not 0 <= character.faces.min() <= character.faces.max() < count:
+        raise ValueError(f"{character.name}: a triangle names a vertex outside [0, {count})")
+    height = float(np.ptp(character.vertices[:, 2])) if count else 0.0
+    if not HEIGHTS[0] <= height <= HEIGHTS[1]:
+        low, high = HEIGHTS
+        raise ValueError(
+            f"{character.name} is {height:.3g} m tall, outside [{low:g}, {high:g}] m; give its height in metres"
+        )
