@@ -1,4 +1,4 @@
-"""The registry of motions: embedded clips, registered ones, installed DeepMimic clips, files by path.
+"""The registry of motions: embedded clips, registered ones, installed DeepMimic clips, files and folders by path.
 
 A new embedded clip is one new file in ``clips/`` with a ``build(rest_joints) -> Motion``; :func:`register_motion` adds
 one from elsewhere.
@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import amass, clips, deepmimic
+from piavatar_envs.avatar.motion.bvh import read_bvh
 from piavatar_envs.avatar.motion.deepmimic import lay_hands_on_ground
 from piavatar_envs.avatar.motion.motion import Motion
+from piavatar_envs.avatar.motion.recording import to_motion
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
@@ -25,7 +29,9 @@ if TYPE_CHECKING:
 DEEPMIMIC_PREFIX = "deepmimic:"
 RATES = 5.0, 1000.0  # [1/s] of motion capture
 ROOT_SPEED = 20.0  # [m/s] of a pelvis, beyond sprinters and falls
-GROUND_WINDOW = 0.8  # [s] longer than any flight in DeepMimic's clips, whose skeleton stands otherwise than ours
+JOINT_SPEED = 25.0  # [rad/s] of a joint, about that of a punch
+GROUND_WINDOW = 0.8  # [s] longer than most flights; other skeletons stand otherwise than ours, so contact drifts
+FILES = "an AMASS .npz, a .bvh, a .glb, .gltf or .vrm with animations, or a DeepMimic .txt file"
 
 
 #: Builds a motion for a body from its joint positions in the rest pose ``(22, 3)`` [m].
@@ -63,14 +69,26 @@ def register_motion(name: str, build: Builder) -> None:
     _registered[name] = build
 
 
-def load_motion(name_or_path: str | Path, asset: AvatarAsset | None = None, body: ShapedBody | None = None) -> Motion:
+def load_motion(
+    name_or_path: str | Path,
+    asset: AvatarAsset | None = None,
+    body: ShapedBody | None = None,
+    *,
+    mapping: Mapping[str, str] | None = None,
+    loop: bool = False,
+) -> Motion:
     """Return a motion by name or path, for a body, standing on the ground.
 
+    A file in which a joint turns faster than 25 rad/s is warned of: its capture has glitches, or a wrong frame rate.
+
     Args:
-        name_or_path: an embedded clip (``"squat"``), a registered one, a DeepMimic clip
-            (``"deepmimic:walk"``), or the path of an AMASS ``.npz`` or a DeepMimic ``.txt`` file.
+        name_or_path: an embedded clip (``"squat"``), a registered one, a DeepMimic clip (``"deepmimic:walk"``), or the
+            path of a file: AMASS ``.npz``, ``.bvh``, ``.glb``, ``.gltf`` or ``.vrm`` (one of several animations by
+            ``"hero.glb#Run"``), DeepMimic ``.txt``.
         asset: the avatar that shall move; without it the embedded body.
         body: one of its shapes; without it the mean shape. Legs of another length scale the root's path.
+        mapping: names of a skeleton's nodes by joint, for BVH and glTF files whose names say too little.
+        loop: close a clip whose end nearly meets its start (:meth:`Motion.meets_itself`); others are left as they are.
 
     Raises:
         ImportError: a DeepMimic clip without the extra ``motions``.
@@ -80,24 +98,33 @@ def load_motion(name_or_path: str | Path, asset: AvatarAsset | None = None, body
     asset = load_asset() if asset is None else asset
     joints = (asset if body is None else body).joints
     name = str(name_or_path)
+    window = None
     if name in list_embedded():
         motion = importlib.import_module(f"{clips.__name__}.{name}").build(joints)
     elif name in _registered:
         motion = _registered[name](joints)
     elif name.startswith(DEEPMIMIC_PREFIX):
-        motion = deepmimic.load_installed(name.removeprefix(DEEPMIMIC_PREFIX), joints)
-        return lay_hands_on_ground(motion, asset, body, GROUND_WINDOW).on_ground(asset, body, window=GROUND_WINDOW)
-    elif Path(name).suffix.lower() == ".txt":
-        motion = _checked(name, deepmimic.load_file(name, joints))
-        return lay_hands_on_ground(motion, asset, body, GROUND_WINDOW).on_ground(asset, body, window=GROUND_WINDOW)
+        motion, window = deepmimic.load_installed(name.removeprefix(DEEPMIMIC_PREFIX), joints), GROUND_WINDOW
     elif isinstance(name_or_path, Path) or Path(name).suffix or "/" in name:
-        motion = _checked(name, amass.load_file(name, joints))
+        motion, window = _load_file(Path(name), joints, mapping)
     else:
-        raise ValueError(
-            f"unknown motion {name!r}; known are {', '.join(list_motions())}, or the path of an AMASS .npz or a "
-            "DeepMimic .txt file"
-        )
-    return motion.on_ground(asset, body)
+        raise ValueError(f"unknown motion {name!r}; known are {', '.join(list_motions())}, or the path of {FILES}")
+    if motion.source.startswith("DeepMimic"):
+        motion = lay_hands_on_ground(motion, asset, body, GROUND_WINDOW)
+    motion = motion.on_ground(asset, body, window=window)
+    return motion.closed() if loop and not motion.loop and motion.meets_itself() else motion
+
+
+def _load_file(path: Path, joints: np.ndarray, mapping: Mapping[str, str] | None) -> tuple[Motion, float | None]:
+    """Return the motion of a file by its suffix, and the window of its ground level [s]."""
+    suffix = path.suffix.lower()
+    if suffix == ".txt":
+        motion = deepmimic.load_file(path, joints)
+    elif suffix == ".bvh":
+        motion = to_motion(read_bvh(path), joints, mapping)
+    else:
+        return _checked(str(path), amass.load_file(path, joints)), None
+    return _checked(str(path), motion), GROUND_WINDOW
 
 
 def _checked(path: str, motion: Motion) -> Motion:
@@ -115,5 +142,14 @@ def _checked(path: str, motion: Motion) -> Motion:
         raise ValueError(
             f"{path}: the root moves at {steps.max():.3g} m/s in frame {steps.argmax()}, it must be <= {ROOT_SPEED:g}; "
             f"{cause}"
+        )
+    turns = motion.joint_speeds()
+    if turns.max() > JOINT_SPEED:
+        frame, joint = np.unravel_index(turns.argmax(), turns.shape)
+        warnings.warn(
+            f"{path}: {JOINT_NAMES[joint]} turns at {turns.max():.3g} rad/s in frame {frame}, and "
+            f"{np.count_nonzero(turns.max(axis=1) > JOINT_SPEED)} of {motion.num_frames} frames are faster than "
+            f"{JOINT_SPEED:g}; its capture may have glitches, or its frame rate be wrong",
+            stacklevel=4,
         )
     return motion

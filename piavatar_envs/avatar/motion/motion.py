@@ -22,6 +22,10 @@ MAX_FPS = 1000.0  # [1/s], beyond any motion capture: a larger figure is a unit 
 UNIT_TOLERANCE = 1e-3  # how far a quaternion's norm may be from 1 before it is refused, not normalised
 SEAM_ANGLE = 1e-3  # [rad] largest joint rotation left between the end and the start of a loop
 SEAM_HEIGHT = 1e-3  # [m] largest root height left between the end and the start of a loop
+NEAR_ANGLE = 0.35  # [rad] of a joint between the end and the start of a clip that can be closed
+NEAR_HEIGHT = 0.05  # [m] of its root
+NEAR_SPEED = 4.0  # [rad/s] by which a joint turns otherwise at the end
+_ENDS = 0, 1, -2, -1
 _MIRROR = np.array([1.0, 1.0, -1.0, -1.0])  # a wxyz rotation seen in a mirror normal to x
 _SWAPPED = [
     JOINT_NAMES.index(
@@ -43,6 +47,7 @@ class Motion:
         root_position: the pelvis joint [m], shape ``(num_frames, 3)``, z up.
         loop: whether sampling past the end starts again, the root carried on.
         source: where the clip comes from, e.g. ``"procedural"`` or ``"DeepMimic humanoid3d_walk"``.
+        notes: what was found or guessed when it was read, one sentence each.
 
     Raises:
         ValueError: wrong shapes, non-finite values, quaternions that are not unit, a rate out of range, or a loop
@@ -55,6 +60,7 @@ class Motion:
     root_position: np.ndarray
     loop: bool = False
     source: str = "unknown"
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         rotations = np.array(self.local_rotations, dtype=np.float64)
@@ -183,6 +189,18 @@ class Motion:
         root[:, 2] += share * (root[0, 2] - root[-1, 2])
         return replace(self, local_rotations=quaternions, root_position=root, loop=True)
 
+    def meets_itself(self) -> bool:
+        """Return whether the end nearly meets the start, up to a turn about the vertical and a step on the ground.
+
+        Poses, and how fast joints turn there, must agree within what a blend hides (:data:`NEAR_ANGLE`,
+        :data:`NEAR_HEIGHT`, :data:`NEAR_SPEED`).
+        """
+        angles, height = self._gap()
+        ends = [Rotation.from_quat(self.local_rotations[frame].reshape(-1, 4), scalar_first=True) for frame in _ENDS]
+        first, last = (self.fps * (ends[i].inv() * ends[i + 1]).as_rotvec() for i in (0, 2))
+        speed = np.linalg.norm(first - last, axis=1).max()
+        return bool(angles.max() < NEAR_ANGLE and height < NEAR_HEIGHT and speed < NEAR_SPEED)
+
     def mirrored(self) -> Motion:
         """Return the clip seen in a mirror: left and right change places, world x changes sign."""
         rotations = self.local_rotations[:, _SWAPPED] * _MIRROR
@@ -222,12 +240,16 @@ class Motion:
         rotations[..., 0, :] = turned(heading * rounds, rotations[..., 0, :])
         return rotations, np.stack([plane.real, plane.imag, root[..., 2]], axis=-1)
 
-    def _require_closed(self) -> None:
+    def _gap(self) -> tuple[np.ndarray, float]:
+        """Return angles by joint [rad] and the height [m] between the last frame and the first, less the heading."""
         target = self.local_rotations[0].copy()
         target[0] = turned(self.loop_heading, target[0])
         gap = Rotation.from_quat(self.local_rotations[-1], scalar_first=True).inv()
         angles = (gap * Rotation.from_quat(target, scalar_first=True)).magnitude()
-        height = abs(self.root_position[-1, 2] - self.root_position[0, 2])
+        return angles, float(abs(self.root_position[-1, 2] - self.root_position[0, 2]))
+
+    def _require_closed(self) -> None:
+        angles, height = self._gap()
         if angles.max() > SEAM_ANGLE or height > SEAM_HEIGHT:
             raise ValueError(
                 f"motion {self.name!r} does not close: {JOINT_NAMES[int(angles.argmax())]} differs by "
