@@ -1,0 +1,374 @@
+"""Surfaces of a glTF file: triangles, skinning and colours, in the pose that the skin was bound in.
+
+Colours are those of the base: factor times vertex colour times texture, which is sampled at the vertices. Morph
+targets, normals and every other texture are left out.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from piavatar_envs.avatar.gltf import Gltf, numbers, whole
+from piavatar_envs.core.extras import install_command
+from piavatar_envs.core.reading import UNREADABLE, reading
+
+MAX_VERTICES, MAX_TRIANGLES = 6_000_000, 6_000_000
+MAX_PIXELS = 2**26  # of a texture
+TEXTURE_SIDE = 1024  # [pixels] to which larger textures are averaged down
+MAX_SETS = 4  # of JOINTS_n and WEIGHTS_n
+SAME_PLACE = 5e-3  # of the size of a skeleton, within which skins agree on a joint
+_SIMPLIFY = "simplify it with: npx @gltf-transform/cli simplify IN.glb OUT.glb"
+_REPEAT, _CLAMP, _MIRROR = 10497, 33071, 33648
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Triangles of one primitive of one node.
+
+    Attributes:
+        name: of the node, or of its mesh.
+        node: that has the mesh.
+        skin: index of its skin; None for a rigid one.
+        material: name of the material, empty without one.
+        points: in the space of the mesh, shape ``(V, 3)`` float64.
+        faces: shape ``(T, 3)`` int64.
+        nodes: that move each vertex, shape ``(V, K)`` int64.
+        weights: their weights, rows sum to one, shape ``(V, K)`` float64.
+        colors: sRGB, shape ``(V, 3)`` uint8.
+    """
+
+    name: str
+    node: int
+    skin: int | None
+    material: str
+    points: np.ndarray
+    faces: np.ndarray
+    nodes: np.ndarray
+    weights: np.ndarray
+    colors: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Pieces of a file, and where they and its nodes are at rest.
+
+    Attributes:
+        pieces: of the scene that is shown.
+        places: points of each piece in the scene, each shape ``(V, 3)`` float64.
+        faces: triangles of each piece, outwards there, each shape ``(T, 3)``.
+        world: transforms of the nodes to the scene, shape ``(N, 4, 4)``.
+        notes: what was left out or guessed, one sentence each.
+    """
+
+    pieces: list[Piece]
+    places: list[np.ndarray]
+    faces: list[np.ndarray]
+    world: np.ndarray
+    notes: tuple[str, ...]
+
+
+def read_surfaces(gltf: Gltf) -> Surfaces:
+    """Return the surfaces of a file at rest.
+
+    That is the pose in which the skins were bound, where they agree on one and its bones are as long as those that the
+    file shows; else the pose that the file shows.
+
+    Raises:
+        ValueError: the file is damaged, or larger than the limits of this module.
+    """
+    with reading(gltf.path, "a glTF character"):
+        reader = _Reader(gltf)
+        pieces = reader.pieces()
+        bound = bind_pose(gltf)
+        if bound is None:
+            world = gltf.world
+            if gltf.skins:
+                reader.notes.append("the skins were bound in poses that do not agree: the pose that is shown is taken")
+            transforms = [world[skin.joints] @ skin.inverse_binds for skin in gltf.skins]
+            places = [_blended(piece, gltf, transforms, world) for piece in pieces]
+            leads = [transform[0] for transform in transforms]
+        else:
+            world, leads = bound
+            size = float(np.ptp(world[:, :3, 3], axis=0).max())
+            if np.abs(world[:, :3, 3] - gltf.world[:, :3, 3]).max() > 2.0 * SAME_PLACE * size:
+                reader.notes.append("the file shows another pose than its skin was bound in, which is taken")
+            places = [
+                _moved(piece.points, world[piece.node] if piece.skin is None else leads[piece.skin]) for piece in pieces
+            ]
+        faces = []
+        for piece in pieces:
+            lead = world[piece.node] if piece.skin is None else leads[piece.skin]
+            faces.append(piece.faces[:, ::-1] if np.linalg.det(lead[:3, :3]) < 0.0 else piece.faces)
+        return Surfaces(pieces, places, faces, world, tuple(dict.fromkeys(reader.notes)))
+
+
+def bind_pose(gltf: Gltf) -> tuple[np.ndarray, list[np.ndarray]] | None:
+    """Return transforms of the nodes to the scene in the bind pose, and of the meshes of each skin.
+
+    An inverse bind matrix ``I`` takes a mesh to the node of its joint, so the joint was at ``M inverse(I)``, with one
+    ``M`` of the whole skin, which the joint nearest to the root gives: it stays where the file shows it.
+
+    Returns:
+        Shapes ``(N, 4, 4)`` and ``(4, 4)`` each; None where no such pose is to be had.
+    """
+    bound: dict[int, np.ndarray] = {}
+    leads: list[np.ndarray] = [np.eye(4)] * len(gltf.skins)
+    depth = np.zeros(len(gltf.parents), dtype=int)
+    for node in gltf.order:
+        depth[node] = 0 if gltf.parents[node] < 0 else depth[gltf.parents[node]] + 1
+    apart = 0.0
+    for index in sorted(range(len(gltf.skins)), key=lambda i: -len(gltf.skins[i].joints)):
+        skin = gltf.skins[index]
+        if np.abs(np.linalg.det(skin.inverse_binds[:, :3, :3])).min() < 1e-18:
+            return None
+        binds = np.linalg.inv(skin.inverse_binds)
+        shared = [j for j, node in enumerate(skin.joints) if int(node) in bound]
+        first = shared[0] if shared else int(depth[skin.joints].argmin())
+        node = int(skin.joints[first])
+        leads[index] = bound.get(node, gltf.world[node]) @ skin.inverse_binds[first]
+        for joint, place in zip(skin.joints, leads[index] @ binds, strict=True):
+            known = bound.setdefault(int(joint), place)
+            apart = max(apart, float(np.abs(known[:3, 3] - place[:3, 3]).max()))
+    if not bound:
+        return (gltf.world, leads) if not gltf.skins else None
+    world = gltf.world.copy()
+    for node in gltf.order:
+        parent = gltf.parents[node]
+        if int(node) in bound:
+            world[node] = bound[int(node)]
+        elif parent >= 0:
+            world[node] = world[parent] @ gltf.local[node]
+    inner = [node for node in bound if gltf.parents[node] in bound]
+    above = gltf.parents[inner]
+    lengths, shown = (np.linalg.norm(w[inner, :3, 3] - w[above, :3, 3], axis=1) for w in (world, gltf.world))
+    size = float(np.ptp(gltf.world[list(bound), :3, 3], axis=0).max())
+    if not np.isfinite(world).all() or apart > SAME_PLACE * size:
+        return None
+    if len(inner) and np.abs(lengths - shown).max() > 0.1 * size:
+        return None
+    return world, leads
+
+
+def _moved(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _blended(piece: Piece, gltf: Gltf, transforms: list[np.ndarray], world: np.ndarray) -> np.ndarray:
+    """Return the points of a piece by linear blend skinning in the pose that the file shows, shape ``(V, 3)``."""
+    if piece.skin is None:
+        return _moved(piece.points, world[piece.node])
+    by_node = np.zeros((len(world), 4, 4))
+    by_node[gltf.skins[piece.skin].joints] = transforms[piece.skin]
+    blend = np.einsum("vk,vkij->vij", piece.weights, by_node[piece.nodes])
+    return np.einsum("vij,vj->vi", blend[:, :3, :3], piece.points) + blend[:, :3, 3]
+
+
+@dataclass
+class _Reader:
+    """Reads primitives once each, within the limits of this module."""
+
+    gltf: Gltf
+    notes: list[str] = field(default_factory=list)
+    _arrays: dict[int, np.ndarray] = field(default_factory=dict)
+    _textures: dict[int, np.ndarray | None] = field(default_factory=dict)
+    _vertices: int = 0
+    _triangles: int = 0
+
+    def pieces(self) -> list[Piece]:
+        """Return the triangles of all nodes that are shown."""
+        pieces = []
+        for index, node in enumerate(self.gltf.items("nodes")):
+            if "mesh" not in node or not self.gltf.shown[index]:
+                continue
+            mesh = self.gltf.item("meshes", node["mesh"])
+            name = self.gltf.names[index] or str(mesh.get("name", ""))
+            for primitive in mesh.get("primitives", []):
+                if primitive.get("mode", 4) in (4, 5, 6) and "POSITION" in primitive.get("attributes", {}):
+                    pieces.append(self.piece(index, node, name, primitive))
+                if primitive.get("targets"):
+                    self.notes.append("morph targets are left out")
+        return [piece for piece in pieces if len(piece.faces)]
+
+    def array(self, index: Any, width: int, what: str) -> np.ndarray:
+        """Return an accessor of some width, read once."""
+        if index not in self._arrays:
+            self._arrays[index] = self.gltf.accessor(index)
+        found = self._arrays[index]
+        if found.shape[1] != width:
+            raise ValueError(f"{what} has {found.shape[1]} numbers a vertex, it must have {width}")
+        return found
+
+    def piece(self, index: int, node: dict[str, Any], name: str, primitive: dict[str, Any]) -> Piece:
+        """Return one primitive, with the vertices that its triangles have."""
+        attributes = primitive["attributes"]
+        what = f"mesh of node {index}"
+        points = self.array(attributes["POSITION"], 3, f"POSITION of the {what}")
+        faces = self.triangles(primitive, len(points), what)
+        self._vertices += len(points)
+        self._triangles += len(faces)
+        if self._vertices > MAX_VERTICES or self._triangles > MAX_TRIANGLES:
+            raise ValueError(f"it has more than {MAX_VERTICES} vertices or {MAX_TRIANGLES} triangles; {_SIMPLIFY}")
+        used, inverse = np.unique(faces, return_inverse=True)
+        faces = inverse.reshape(-1, 3)
+        skin = None
+        nodes, weights = np.full((len(used), 1), index), np.ones((len(used), 1))
+        if "skin" in node and "JOINTS_0" in attributes:
+            skin = whole(node["skin"], f"skin of node {index}", len(self.gltf.skins) - 1)
+            nodes, weights = self.skinning(attributes, skin, used, len(points), what)
+        number = primitive.get("material")
+        material = {} if number is None else self.gltf.item("materials", number)
+        colors = self.colors(material, attributes, used, len(points), what)
+        label = str(material.get("name", ""))[:200]
+        return Piece(name, index, skin, label, points[used].astype(np.float64), faces, nodes, weights, colors)
+
+    def triangles(self, primitive: dict[str, Any], count: int, what: str) -> np.ndarray:
+        """Return the triangles of a primitive, of a list, a strip or a fan; shape ``(T, 3)`` int64."""
+        if "indices" in primitive:
+            corners = self.array(primitive["indices"], 1, f"indices of the {what}")[:, 0]
+            if corners.dtype.kind not in "iu":
+                raise ValueError(f"indices of the {what} are no whole numbers")
+            corners = corners.astype(np.int64)
+            if corners.min() < 0 or corners.max() >= count:
+                raise ValueError(
+                    f"indices of the {what} reach from {corners.min()} to {corners.max()} of {count} vertices"
+                )
+        else:
+            corners = np.arange(count)
+        if primitive.get("mode", 4) == 4:
+            return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        steps = np.arange(max(len(corners) - 2, 0))
+        if primitive["mode"] == 5:
+            odd = steps % 2
+            return np.stack([corners[steps + odd], corners[steps + 1 - odd], corners[steps + 2]], axis=1)
+        return np.stack([np.full(len(steps), corners[0]), corners[steps + 1], corners[steps + 2]], axis=1)
+
+    def skinning(
+        self, attributes: dict[str, Any], skin: int, used: np.ndarray, count: int, what: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return nodes and weights of the vertices, shapes ``(V, K)``; one without weight hangs on the skin's first."""
+        joints = self.gltf.skins[skin].joints
+        found = []
+        for number in range(MAX_SETS):
+            if f"JOINTS_{number}" not in attributes:
+                break
+            columns = [
+                self.array(attributes.get(f"{key}_{number}"), 4, f"{key}_{number} of the {what}")
+                for key in ("JOINTS", "WEIGHTS")
+            ]
+            if len(columns[0]) != count or len(columns[1]) != count:
+                raise ValueError(f"skinning of the {what} has {len(columns[0])} rows for {count} vertices")
+            found.append([column[used] for column in columns])
+        which = np.concatenate([pair[0] for pair in found], axis=1).astype(np.int64)
+        weights = np.maximum(np.concatenate([pair[1] for pair in found], axis=1).astype(np.float64), 0.0)
+        which = np.where(weights > 0.0, which, 0)
+        if which.max() >= len(joints):
+            raise ValueError(f"JOINTS of the {what} name joint {which.max()} of {len(joints)}")
+        total = weights.sum(axis=1)
+        if (total < 1e-6).any():
+            self.notes.append(f"{int((total < 1e-6).sum())} vertices of {what} have no weights: they follow the root")
+            weights[total < 1e-6, 0] = 1.0
+        return joints[which], weights / weights.sum(axis=1, keepdims=True)
+
+    def colors(
+        self, material: dict[str, Any], attributes: dict[str, Any], used: np.ndarray, count: int, what: str
+    ) -> np.ndarray:
+        """Return base colours of the vertices, sRGB, shape ``(V, 3)`` uint8."""
+        base = material.get("pbrMetallicRoughness") or {}
+        factor, texture = base.get("baseColorFactor"), base.get("baseColorTexture")
+        older = (material.get("extensions") or {}).get("KHR_materials_pbrSpecularGlossiness")
+        if older and factor is None and texture is None:
+            factor, texture = older.get("diffuseFactor"), older.get("diffuseTexture")
+        linear = np.ones((len(used), 3))
+        if factor is not None:
+            linear = linear * numbers(factor, 4, "base colour of a material")[:3]
+        if "COLOR_0" in attributes:
+            stored = self.gltf.accessor(attributes["COLOR_0"])
+            if stored.shape[1] not in (3, 4) or len(stored) != count:
+                raise ValueError(f"COLOR_0 of the {what} has shape {stored.shape} for {count} vertices")
+            linear = linear * stored[used, :3]
+        if texture is not None:
+            linear = linear * self.sampled(texture, attributes, used, count, what)
+        linear = np.clip(linear, 0.0, 1.0)
+        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+        return np.round(255.0 * srgb).astype(np.uint8)
+
+    def sampled(
+        self, info: dict[str, Any], attributes: dict[str, Any], used: np.ndarray, count: int, what: str
+    ) -> np.ndarray:
+        """Return linear colours of a texture at the vertices, shape ``(V, 3)``; white where it cannot be read."""
+        number = whole(info.get("index"), "index of a texture", len(self.gltf.items("textures")) - 1)
+        if number not in self._textures:
+            self._textures[number] = self.texture(number)
+        pixels = self._textures[number]
+        moved = (info.get("extensions") or {}).get("KHR_texture_transform") or {}
+        channel = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
+        if pixels is None or channel not in attributes:
+            return np.ones((len(used), 3))
+        uv = self.array(attributes[channel], 2, f"{channel} of the {what}")
+        if len(uv) != count:
+            raise ValueError(f"{channel} of the {what} has {len(uv)} rows for {count} vertices")
+        uv = uv[used] * numbers(moved.get("scale", (1, 1)), 2, "scale of a texture")
+        turn = numbers([moved.get("rotation", 0)], 1, "rotation of a texture")[0]
+        cos, sin = np.cos(turn), np.sin(turn)
+        uv = uv @ np.array([[cos, -sin], [sin, cos]]) + numbers(moved.get("offset", (0, 0)), 2, "offset of a texture")
+        sampler = self.gltf.item("textures", number).get("sampler")
+        wraps = {} if sampler is None else self.gltf.item("samplers", sampler)
+        height, width = pixels.shape[:2]
+        x0, x1, tx = _neighbours(uv[:, 0], width, wraps.get("wrapS", _REPEAT))
+        y0, y1, ty = _neighbours(uv[:, 1], height, wraps.get("wrapT", _REPEAT))
+        value = pixels / 255.0
+        corners = [value[y, x] for y in (y0, y1) for x in (x0, x1)]
+        rows = [a + tx[:, None] * (b - a) for a, b in (corners[:2], corners[2:])]
+        srgb = rows[0] + ty[:, None] * (rows[1] - rows[0])
+        return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+    def texture(self, number: int) -> np.ndarray | None:
+        """Return the pixels of a texture, shape ``(H, W, 3)`` uint8; None, and a note, where it cannot be read."""
+        try:
+            from PIL import Image
+        except ImportError:
+            self.notes.append(f"textures are left out, for want of Pillow: {install_command('render')}")
+            return None
+        entry = self.gltf.item("textures", number)
+        source = ((entry.get("extensions") or {}).get("EXT_texture_webp") or entry).get("source")
+        if source is None:
+            self.notes.append(f"texture {number} is in a format that is not read: its surfaces have plain colours")
+            return None
+        image = self.gltf.item("images", source)
+        what = f"image {source}"
+        try:
+            content = (
+                self.gltf.resource(image["uri"], what)
+                if "uri" in image
+                else self.gltf.buffer_view(image["bufferView"], what)
+            )
+            with Image.open(io.BytesIO(content)) as picture:
+                if picture.width * picture.height > MAX_PIXELS:
+                    raise ValueError(f"it has {picture.width} x {picture.height} pixels, more than {MAX_PIXELS}")
+                picture = picture.convert("RGB")
+                picture.thumbnail((TEXTURE_SIDE, TEXTURE_SIDE))
+                return np.asarray(picture)
+        except (*UNREADABLE, Image.DecompressionBombError) as error:
+            self.notes.append(f"texture {number} is left out: {str(error).splitlines()[0] if str(error) else error!r}")
+            return None
+
+
+def _neighbours(at: np.ndarray, size: int, wrap: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the two pixels beside each coordinate in [0, 1], and how far it is to the second."""
+    place = at * size - 0.5
+    first = np.floor(np.clip(place, -1e9, 1e9)).astype(np.int64)
+    share = place - first
+
+    def inside(pixel: np.ndarray) -> np.ndarray:
+        if wrap == _CLAMP:
+            return np.clip(pixel, 0, size - 1)
+        if wrap == _MIRROR:
+            folded = pixel % (2 * size)
+            return np.where(folded < size, folded, 2 * size - 1 - folded)
+        return pixel % size
+
+    return inside(first), inside(first + 1), share
