@@ -150,7 +150,7 @@ def test_missing_joints_are_made_where_the_embedded_body_has_them(lacks, far, as
     for joint in sorted(lacks, key=joint_index, reverse=True):
         poor[:, PARENTS[joint_index(joint)]] += poor[:, joint_index(joint)]
         poor[:, joint_index(joint)] = 0.0
-    spread = rigs.spread_weights(found, poor, asset.vertices, joints)
+    spread = rigs.spread_weights(poor, asset.vertices, joints)
     assert np.allclose(spread.sum(axis=1), 1.0) and spread.min() >= 0.0
     for joint in lacks - {"left_collar", "right_collar"}:
         index = joint_index(joint)

@@ -13,13 +13,12 @@ import numpy as np
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, Look, top_weights
 from piavatar_envs.avatar.body.closed_skin import CELL, Soup, close_skin, read_soup
-from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.rigs import spread_weights
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs
 
 #: Standing heights that are taken for those of a person [m].
 HEIGHTS = (0.3, 3.0)
-#: Joints that bodies without weights of their own get by interpolation point to the next one along these.
-_NEXT = {"pelvis": "spine1", "spine3": "neck"}
 
 
 @dataclass(frozen=True)
@@ -139,24 +138,8 @@ def to_reference_pose(character: Character) -> Character:
 
 
 def with_all_joints(character: Character) -> Character:
-    """Return the character with flesh on every joint: one that no vertex follows takes a share of its parent's.
-
-    Files without toes, collars or a third joint of the spine have such. The share rises along the bone, from nothing
-    a quarter of a bone before the joint to all a quarter after it.
-    """
-    weights = np.array(character.weights, np.float64)
-    for joint in range(1, NUM_JOINTS):
-        if weights[:, joint].max(initial=0.0) > 0.0:
-            continue
-        donor = PARENTS[joint]
-        children = [child for child in range(NUM_JOINTS) if PARENTS[child] == joint]
-        following = joint_index(_NEXT.get(JOINT_NAMES[joint], JOINT_NAMES[children[0]])) if children else joint
-        axis = character.joints[following] - character.joints[joint if children else donor]
-        along = (character.vertices - character.joints[joint]) @ axis / max(float(axis @ axis), 1e-12)
-        share = np.clip(0.5 + 2.0 * along, 0.0, 1.0) * weights[:, donor]
-        weights[:, joint] += share
-        weights[:, donor] -= share
-    return replace(character, weights=weights)
+    """Return the character with flesh on every joint: one that no vertex follows takes a share of its parent's."""
+    return replace(character, weights=spread_weights(character.weights, character.vertices, character.joints))
 
 
 def _reference_rotations(joints: np.ndarray) -> np.ndarray:

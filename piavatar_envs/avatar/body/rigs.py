@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.core.reading import reading
 
 SIDES = ("left", "right")
@@ -78,6 +78,8 @@ PELVIS_ABOVE = 0.057  # the middle of the hips, in lengths of the leg
 FOOT_AHEAD, FOOT_BELOW = 0.166, 0.053  # of the toe joint from the ankle, in lengths of the leg
 LEAST_NECK = 0.7  # of the way from the hips to the head, for a nameless node
 NEAR_HIPS = 0.5  # lengths of the leg that a pelvis node may be away from the middle of the hips
+#: The joint at the far end of those that have several.
+_ABOVE = {"pelvis": joint_index("spine1"), "spine3": joint_index("neck")}
 _FEW_DEFORMERS = 12  # names with DEF- that make the others controls
 
 
@@ -259,40 +261,42 @@ def axes_of(joint_map: JointMap, positions: np.ndarray, tips: np.ndarray | None 
     return (near if snaps else axes), mirrors
 
 
-def spread_weights(joint_map: JointMap, weights: np.ndarray, points: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Give the joints that a rig lacks their share of the weights, each from the joint below it that has them.
+def spread_weights(weights: np.ndarray, points: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Give flesh to joints that none follows, as those that a rig lacks: each takes some from the joint it hangs on.
 
-    Across a joint the weight changes over from the bone below to its own, within half of the way to its neighbours.
+    Beyond the plane through the joint the weight is its own, and it changes over within a quarter of the way to its
+    neighbours.
 
     Args:
-        joint_map: of the rig.
         weights: by joint, rows sum to one, shape ``(V, 22)``.
         points: of the skin [m], shape ``(V, 3)``.
-        joints: of :func:`joints_of` [m], shape ``(22, 3)``.
+        joints: where the joints are [m], shape ``(22, 3)``.
 
     Returns:
         Weights whose rows sum to one, shape ``(V, 22)``.
     """
     spread = np.array(weights, dtype=np.float64)
-    chain = ("pelvis", *_SPINE_JOINTS, "neck", "head")
-    places = {joint: joints[joint_index(joint)] for joint in JOINT_NAMES}
-    for below, joint, above in zip(chain, chain[1:], chain[2:], strict=False):
-        if joint in joint_map.missing:
-            _hand_over(spread, points, (below, joint), places[below], places[joint], places[above])
-    for side in SIDES:
-        collar, shoulder, foot = f"{side}_collar", f"{side}_shoulder", f"{side}_foot"
-        if collar in joint_map.missing:
+    for joint in range(1, NUM_JOINTS):
+        if spread[:, joint].max(initial=0.0) > 0.0:
+            continue
+        name, parent = JOINT_NAMES[joint], PARENTS[joint]
+        below, at = joints[parent], np.array(joints[joint])
+        child = _ABOVE.get(name, next((c for c in range(NUM_JOINTS) if PARENTS[c] == joint), None))
+        if name.endswith("foot"):
+            at[2] = below[2]  # the sole is level
+        above = 2.0 * at - below if child is None else joints[child]
+        share = np.ones(len(points))
+        if name.endswith("collar"):
             # Beside the shoulder only: the flank hangs on the chest.
-            reach = float(np.linalg.norm(places[shoulder] - places[collar]))
-            away = _distance_to_segment(points, places[collar], places[shoulder])
-            near = np.clip(2.0 - away / reach, 0.0, 1.0)
-            _hand_over(
-                spread, points, ("spine3", collar), places["spine3"], places[collar], places[shoulder], share=near
-            )
-        if foot in joint_map.missing:
-            ankle = places[f"{side}_ankle"]
-            ahead = np.array([places[foot][0], places[foot][1], ankle[2]])  # the sole is level
-            _hand_over(spread, points, (f"{side}_ankle", foot), ankle, ahead, 2.0 * ahead - ankle)
+            away = _distance_to_segment(points, at, above)
+            share = np.clip(2.0 - away / max(float(np.linalg.norm(above - at)), 1e-9), 0.0, 1.0)
+        lower, upper = float(np.linalg.norm(at - below)), float(np.linalg.norm(above - at))
+        along = (above - below) / max(float(np.linalg.norm(above - below)), 1e-9)
+        beyond = (points - at) @ along
+        ramp = np.clip(0.5 + 2.0 * beyond / np.maximum(np.where(beyond < 0.0, lower, upper), 1e-9), 0.0, 1.0)
+        moved = ramp * share * spread[:, parent]
+        spread[:, joint] += moved
+        spread[:, parent] -= moved
     return spread
 
 
@@ -515,35 +519,6 @@ def _distance_to_segment(points: np.ndarray, start: np.ndarray, end: np.ndarray)
     along = end - start
     share = np.clip((points - start) @ along / (along @ along), 0.0, 1.0)
     return np.linalg.norm(points - start - share[:, None] * along, axis=1)
-
-
-def _hand_over(
-    weights: np.ndarray,
-    points: np.ndarray,
-    pair: tuple[str, str],
-    below: np.ndarray,
-    at: np.ndarray,
-    above: np.ndarray,
-    share: np.ndarray | float = 1.0,
-) -> None:
-    """Move the weight of a pair's first joint to its second beyond the plane through that one.
-
-    Args:
-        weights: by joint, changed in place, shape ``(V, 22)``.
-        points: of the skin, shape ``(V, 3)``.
-        pair: names of the joint that gives and the joint that takes.
-        below: position of the one that gives.
-        at: position of the one that takes.
-        above: position of the next one.
-        share: the most that is moved, of each point.
-    """
-    giver, taker = (joint_index(joint) for joint in pair)
-    lower, upper = float(np.linalg.norm(at - below)), float(np.linalg.norm(above - at))
-    beyond = (points - at) @ ((above - below) / np.linalg.norm(above - below))
-    ramp = np.clip(0.5 + 0.5 * beyond / (0.5 * np.where(beyond < 0.0, lower, upper)), 0.0, 1.0)
-    moved = ramp * share * weights[:, giver]
-    weights[:, taker] += moved
-    weights[:, giver] -= moved
 
 
 def _by_hand(mapping: Mapping[str, str], names: list[str]) -> dict[str, int | None]:

@@ -292,6 +292,7 @@ def volume_ratios(links: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.
     return np.clip(np.linalg.det(gradient), 0.1, 10.0)
 
 
+MOST_SPACING = 0.05  # lattice spacing over the height of the body
 SPACING_PER_DX = 0.57  # lattice spacing over grid spacing: about 5 particles a cell
 SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
@@ -359,10 +360,11 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
         bone_rings: rings of five bone particles along every bone.
 
     Raises:
-        ValueError: the spacing is not positive or above 8 cm, too few rings, or a bone outside the skin.
+        ValueError: the spacing is not positive or too coarse for the body, too few rings, or a bone outside the skin.
     """
-    if not 0.0 < spacing <= 0.08:
-        raise ValueError(f"spacing={spacing} m is outside (0, 0.08]; coarser would lose hands and feet")
+    coarsest = MOST_SPACING * float(np.ptp(asset.vertices[:, 2]))
+    if not 0.0 < spacing <= coarsest:
+        raise ValueError(f"spacing={spacing} m is outside (0, {coarsest:.3g}]; coarser would lose hands and feet")
     if bone_rings < 4:
         raise ValueError(f"bone_rings={bone_rings} gives under {MIN_BONE_PARTICLES} particles a bone; use 4 or more")
     skin = ClosedSurface(asset.vertices, asset.faces)
