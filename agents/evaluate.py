@@ -36,8 +36,15 @@ from piavatar_envs.api.host import EpisodeHost
 Agent = Callable[[np.ndarray], np.ndarray]
 #: Width of a class of pushes [N s].
 PUSH_CLASS = 5.0
-#: Metrics of tasks that evaluations average.
-EVALUATED_METRICS = ("distance", "strongest_push")
+#: Metrics of TrackMotion, their names in rows, and factors to the units of Luo et al., "Perpetual humanoid control for
+#: real-time simulated avatars", 2023, which measures an imitation by them and by the share that is not given up.
+TRACKING = {
+    "mpjpe": ("g_mpjpe_mm", 1000.0),
+    "local_mpjpe": ("mpjpe_mm", 1000.0),
+    "acceleration_error": ("acceleration_error_mm", 1.0),
+}
+#: Metrics of tasks that evaluations read.
+EVALUATED_METRICS = ("distance", "strongest_push", *TRACKING)
 #: Seconds between two updates of the bar in a log.
 _LOG_SECONDS = 30.0
 
@@ -55,6 +62,7 @@ class Episode:
         terminated: whether it ended before its time, as by a fall.
         distance: mean over the steps of the task's ``distance`` [m], where it has one.
         push: greatest impulse of a push [N s], where the task pushes, or None.
+        tracking: means over the steps of the metrics in :data:`TRACKING`, where the task has them.
         failure: whether the simulation has failed.
         agent_totals: undiscounted return of every agent of a world, shape ``(agents,)``; None where there is one.
         agent_success: whether each had fulfilled its task in its last step, shape ``(agents,)``, or None.
@@ -68,6 +76,7 @@ class Episode:
     terminated: bool = False
     distance: float = 0.0
     push: float | None = None
+    tracking: dict[str, float] = field(default_factory=dict)
     failure: bool = False
     agent_totals: np.ndarray | None = None
     agent_success: np.ndarray | None = None
@@ -81,6 +90,9 @@ class Episode:
         self.successes += self.success_at_end
         self.distance += (float(info.get("distance", np.nan)) - self.distance) / self.steps
         self.push = info.get("strongest_push")
+        for name in TRACKING.keys() & info.keys():
+            mean = self.tracking.get(name, 0.0)
+            self.tracking[name] = mean + (float(info[name]) - mean) / self.steps
         self.failure = bool(info.get("failure"))
         if "rewards" in info:
             self.agent_totals = info["rewards"] + (0.0 if self.agent_totals is None else self.agent_totals)
@@ -130,6 +142,11 @@ class Evaluation:
         }
         if self.episodes[0].push is not None:
             row["by_push"] = by_push(self.episodes)
+        if self.episodes[0].tracking:
+            kept = [not episode.terminated for episode in self.episodes]
+            row |= {"followed": float(np.mean(kept)), "followed_interval": share_interval(kept)}
+            for name, (key, factor) in TRACKING.items():
+                row[key] = factor * self.share(lambda e, name=name: e.tracking[name])
         if self.episodes[0].agent_totals is not None:
             of_agents = [mean_and_interval(totals) for totals in np.transpose([e.agent_totals for e in self.episodes])]
             row["agent_return_mean"] = [one.mean for one in of_agents]
@@ -188,6 +205,11 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for name in ("success_once", "success_at_end"):
         shares = [row[name] for row in rows]
         summed |= {name: float(np.mean(shares)), f"{name}_interval": share_interval_over_seeds(shares, episodes)}
+    if all("followed" in row for row in rows):
+        shares = [row["followed"] for row in rows]
+        summed |= {"followed": float(np.mean(shares))}
+        summed |= {"followed_interval": share_interval_over_seeds(shares, episodes)}
+        summed |= {key: float(np.mean([row[key] for row in rows])) for key, _ in TRACKING.values()}
     if "by_push" in rows[0]:
         summed["by_push"] = _pooled([push for row in rows for push in row["by_push"]], len(rows))
     return summed | {"failures": sum(row["failures"] for row in rows)}

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from agents.evaluate import Evaluation
+from agents.evaluate import TRACKING, Evaluation
 from agents.files import describe_run, plain, write_atomically, write_json
 from agents.intervals import Estimate
 from agents.sb3.matches import Match
@@ -28,8 +28,13 @@ def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
     table.add_column("agent", no_wrap=True)
     for column in ("return", "95 % interval", "once", "at end", "of time", "distance"):
         table.add_column(column, justify="right", no_wrap=True)
-    for evaluation in evaluations:
-        row = evaluation.row()
+    rows = [evaluation.row() for evaluation in evaluations]
+    tracking = [key for key, _ in TRACKING.values()] if "followed" in rows[0] else []
+    if tracking:
+        table.caption += "; followed: to the end; G-MPJPE and MPJPE in mm, acceleration error in mm/frame^2"
+    for column in ("followed", "G-MPJPE", "MPJPE", "accel.") if tracking else ():
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in rows:
         low, high = row["return_interval"]
         distance = row["mean_distance_m"]
         table.add_row(
@@ -40,6 +45,7 @@ def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
             f"{row['success_at_end']:.0%}",
             f"{row['success_share_of_steps']:.0%}",
             "" if distance is None else f"{distance:.2f} m",
+            *([f"{row['followed']:.0%}", *(f"{row[key]:.1f}" for key in tracking)] if tracking else []),
         )
     console.print(table)
 

@@ -31,6 +31,7 @@ from agents import compare
 from agents.checkpoint import flattened
 from agents.command import one_line_errors
 from agents.config import check_imports
+from agents.evaluate import TRACKING
 from agents.files import (
     RESULTS,
     check_figures,
@@ -247,6 +248,9 @@ def markdown(rows: Sequence[Mapping[str, Any]], about: str) -> str:
         own = [row for row in rows if row["env_id"] == env_id]
         lines += [f"## {env_id}", "", _line(_COLUMNS), _line(["---"] * len(_COLUMNS))]
         lines += [_line(_cells(row)) for row in own]
+        followed = [row for row in own if row.get("followed") is not None]
+        if followed:
+            lines += ["", *_tracking(followed)]
         pushed = [row for row in own if row.get("by_push")]
         if pushed:
             lines += ["", *_pushes(pushed)]
@@ -279,6 +283,17 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         _with(row["mean_steps"], row["steps_interval"], ".0f"),
         trained,
     ]
+
+
+def _tracking(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Format how closely motions were followed, in the terms of PHC."""
+    columns = ("agent", "control", "followed to the end", "G-MPJPE [mm]", "MPJPE [mm]", "acceleration [mm/frame^2]")
+    lines = [_line(columns), _line(["---"] * len(columns))]
+    for row in rows:
+        share = _with(row["followed"], row["followed_interval"], ".0%")
+        figures = [f"{row[key]:.1f}" for key, _ in TRACKING.values()]
+        lines.append(_line([row["agent"], row.get("control") or "", share, *figures]))
+    return ["How closely the motions were followed:", "", *lines]
 
 
 def _pushes(rows: Sequence[Mapping[str, Any]]) -> list[str]:

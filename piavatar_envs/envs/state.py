@@ -95,17 +95,30 @@ def _check_finite(name: str, value: np.ndarray, failed: np.ndarray) -> None:
 
 
 def file_digests(config: BaseModel) -> dict[str, str]:
-    """Return a digest of every file that a setting names by its path (a clip, a mesh), by the setting's dotted name."""
+    """Return a digest of every file that a setting names by its path (a clip, a mesh), by the setting's dotted name.
+
+    A file may be followed by ``#`` and the name of a part. Of a folder, the names and contents of all its files count.
+    """
 
     def files(value: Any, name: str) -> Iterator[tuple[str, Path]]:
         if isinstance(value, (Mapping, list)):
             for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
                 yield from files(item, f"{name}.{key}" if name else str(key))
-        elif isinstance(value, str) and (Path(value).suffix or "/" in value) and Path(value).is_file():
-            yield name, Path(value)
+        elif isinstance(value, str) and (Path(value).suffix or "/" in value):
+            paths = (Path(text) for text in (value, value.rpartition("#")[0]) if text)
+            yield from ((name, path) for path in paths if path.is_file() or ("/" in value and path.is_dir()))
 
-    found = files(config.model_dump(mode="json"), "")
-    return {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in found}
+    return {name: _digest(path) for name, path in files(config.model_dump(mode="json"), "")}
+
+
+def _digest(path: Path) -> str:
+    """Return a digest of a file, or of all files of a folder."""
+    if path.is_file():
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    digest = hashlib.sha256()
+    for file in sorted(file for file in path.rglob("*") if file.is_file()):
+        digest.update(f"{file.relative_to(path).as_posix()}\0{_digest(file)}\n".encode())
+    return digest.hexdigest()[:16]
 
 
 def settings_rows(config: BaseModel, num_envs: int, files: Mapping[str, str]) -> np.ndarray:

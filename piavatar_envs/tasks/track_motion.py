@@ -9,9 +9,10 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.avatar.body.rigs import read_mapping
 from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.kinematics import pose_body
-from piavatar_envs.avatar.motion import load_motion
+from piavatar_envs.avatar.motion.collection import Sampling, Split, chosen, find_motions, load_frames
 from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_log, turn_about_z
 from piavatar_envs.avatar.skinning import bones_of, weights_of
 from piavatar_envs.avatar.torque_control.controller import TorqueController
@@ -42,8 +43,19 @@ LONGEST_LEGS = 1.3
 class TrackMotionConfig(EnvConfig):
     """Settings of TrackMotion."""
 
-    motion: str = Field("step", description="name of a clip, or the path of an AMASS .npz or a DeepMimic .txt file")
-    random_start: bool = Field(True, description="begin anywhere in a clip that loops")
+    motion: str | tuple[str, ...] = Field(
+        "step",
+        description="name of a clip, path of a motion file, or of a folder of them (with a slash: ./walks), or a list "
+        "of these; each episode draws one motion of all",
+    )
+    split: Split = Field("all", description="motions to draw from: all, or a part by the hash of their names")
+    held_out_share: float = Field(0.2, ge=0.0, le=1.0, description="share of motions that a split holds out [-]")
+    loop: bool = Field(False, description="close clips whose end nearly meets their start, and go on")
+    motion_mapping: str | None = Field(
+        None,
+        description="JSON file that names nodes of BVH and glTF skeletons by joint; null finds them by their names",
+    )
+    random_start: bool = Field(True, description="begin anywhere in a clip that loops, or is longer than the episode")
     root_action: bool = Field(True, description="whether x, y and yaw of the root act too")
     impulse: float = Field(20.0, ge=0.0, le=1000.0, description="greatest impulse on the body, 0 for none [N s]")
     impulse_interval: float = Field(1.0, gt=0.0, le=3600.0, description="time between impulses [s]")
@@ -54,21 +66,24 @@ class TrackMotionConfig(EnvConfig):
 
 @wp.struct
 class Clip:
-    """A motion at the control rate, and constants of its reward."""
+    """Motions at the control rate, one after the other, and constants of the reward."""
 
     rotation: wp.array2d(dtype=wp.quat)  # (frames, 22) local
     root: wp.array(dtype=wp.vec3)  # (frames,) [m]
-    pelvis_height: float  # of the body that the clip was loaded for, at rest [m]
-    starts: int  # an episode begins at a frame below this
+    first: wp.array(dtype=int)  # frame of each motion, and the number of all frames
+    starts: wp.array(dtype=int)  # an episode begins at a frame of its motion below this
+    pelvis_height: float  # of the body that the motions were loaded for, at rest [m]
     success_distance: float
     fail_distance: float
     control_cost: float
 
 
 @wp.func
-def frame_of(clip: Clip, start: int, step: int):
-    """Return the frame after ``step`` steps: clamped, because a restored state may hold any frame."""
-    return wp.clamp(start + step, 0, clip.root.shape[0] - 1)
+def frame_of(clip: Clip, playing: int, start: int, step: int):
+    """Return the frame after ``step`` steps: clamped, because a restored state may hold any motion and frame."""
+    motion = wp.clamp(playing, 0, clip.starts.shape[0] - 1)
+    first = clip.first[motion]
+    return first + wp.clamp(start + step, 0, clip.first[motion + 1] - first - 1)
 
 
 @wp.func
@@ -84,21 +99,26 @@ def draw_start(
     clip: Clip,
     body: Body,
     # out
+    playing: wp.array(dtype=int),
     start: wp.array(dtype=int),
     origin: wp.array(dtype=wp.vec3),
     command_rotation: wp.array2d(dtype=wp.quat),
     command_root: wp.array(dtype=wp.vec3),
 ):
-    """Draw the frame at which the episode enters the clip; the body starts in its pose, over the world's origin."""
+    """Draw a motion, and the frame at which the episode enters it; the body starts in its pose, over the origin."""
     e, b = wp.tid()
     if not episodes.mask[e]:
         return
+    of_motion = random_of(episodes, e, STREAM_TASK, 1)
+    motion = wp.randi(of_motion, 0, clip.starts.shape[0])
     random = random_of(episodes, e, STREAM_TASK, 0)
-    first = wp.randi(random, 0, clip.starts)
-    command_rotation[e, b] = clip.rotation[first, b]
+    entered = wp.randi(random, 0, clip.starts[motion])
+    frame = clip.first[motion] + entered
+    command_rotation[e, b] = clip.rotation[frame, b]
     if b == 0:
-        start[e] = first
-        at = root_of(clip, body, e, first)
+        playing[e] = motion
+        start[e] = entered
+        at = root_of(clip, body, e, frame)
         origin[e] = wp.vec3(at[0], at[1], 0.0)
         command_root[e] = wp.vec3(0.0, 0.0, at[2])
 
@@ -108,6 +128,7 @@ def advance_reference(
     clip: Clip,
     body: Body,
     action_map: ActionMap,
+    playing: wp.array(dtype=int),
     start: wp.array(dtype=int),
     episodes: Episodes,
     command_rotation: wp.array2d(dtype=wp.quat),
@@ -122,8 +143,8 @@ def advance_reference(
     widened to the clip's own pose.
     """
     e, b = wp.tid()
-    now = frame_of(clip, start[e], episodes.step_count[e])
-    after = frame_of(clip, start[e], episodes.step_count[e] + 1)
+    now = frame_of(clip, playing[e], start[e], episodes.step_count[e])
+    after = frame_of(clip, playing[e], start[e], episodes.step_count[e] + 1)
     step = wp.quat_inverse(clip.rotation[now, b]) * clip.rotation[after, b]
     q = wp.normalize(command_rotation[e, b] * step)
     own = quat_log(clip.rotation[after, b])
@@ -140,6 +161,7 @@ def advance_reference(
 def read_clip(
     clip: Clip,
     body: Body,
+    playing: wp.array(dtype=int),
     start: wp.array(dtype=int),
     origin: wp.array(dtype=wp.vec3),
     episodes: Episodes,
@@ -149,7 +171,7 @@ def read_clip(
 ):
     """Read the clip's pose one step ahead of the step counter."""
     e, b = wp.tid()
-    frame = frame_of(clip, start[e], episodes.step_count[e] + 1)
+    frame = frame_of(clip, playing[e], start[e], episodes.step_count[e] + 1)
     rotation[e, b] = clip.rotation[frame, b]
     if b == 0:
         root[e] = root_of(clip, body, e, frame) - origin[e]
@@ -231,21 +253,37 @@ def judge(
     clip_position: wp.array2d(dtype=wp.vec3),
     impulse: wp.array(dtype=wp.vec3),
     action: wp.array3d(dtype=float),
+    # in and out
+    errors: wp.array3d(dtype=wp.vec3),
     # out
     outcome: Outcome,
 ):
-    """Reward positions and rotations close to the clip's."""
+    """Reward positions and rotations close to the clip's.
+
+    The error of an acceleration is the second difference of the error of a position; ``errors`` holds those of the
+    last two steps. Before an episode they are zero, because its body begins in the clip's pose.
+    """
     e = wp.tid()
     count = bones.local.shape[1]
     distance = float(0.0)
+    local = float(0.0)
+    acceleration = float(0.0)
     angle = float(0.0)
+    root = bones.position[e, 0] - clip_position[e, 0]
     for b in range(count):
-        distance += wp.length(bones.position[e, b] - clip_position[e, b]) / float(count)
+        error = bones.position[e, b] - clip_position[e, b]
+        distance += wp.length(error) / float(count)
+        local += wp.length(error - root) / float(count)
+        acceleration += wp.length(error - 2.0 * errors[e, 0, b] + errors[e, 1, b]) / float(count)
+        errors[e, 1, b] = errors[e, 0, b]
+        errors[e, 0, b] = error
         angle += wp.length(quat_log(wp.quat_inverse(clip_rotation[e, b]) * bones.local[e, b])) / float(count)
     outcome.terms[e, 0, TrackMotionTask.rewards.position] = 0.6 * tolerance(distance, 0.01, 0.3)
     outcome.terms[e, 0, TrackMotionTask.rewards.rotation] = 0.4 * tolerance(angle, 0.01, 0.5)
     outcome.terms[e, 0, TrackMotionTask.rewards.control] = -clip.control_cost * mean_square_action(action, e, 0)
     outcome.metrics[e, 0, TrackMotionTask.metrics.mpjpe] = distance
+    outcome.metrics[e, 0, TrackMotionTask.metrics.local_mpjpe] = local
+    outcome.metrics[e, 0, TrackMotionTask.metrics.acceleration_error] = 1000.0 * acceleration
     outcome.metrics[e, 0, TrackMotionTask.metrics.rotation_error_deg] = wp.degrees(angle)
     outcome.metrics[e, 0, TrackMotionTask.metrics.root_error] = wp.length(bones.position[e, 0] - clip_position[e, 0])
     outcome.metrics[e, 0, TrackMotionTask.metrics.impulse] = wp.length(impulse[e])
@@ -298,12 +336,19 @@ class TrackMotionTask(Task):
         CONTROL,
     )
     metrics = (
-        Metric("mpjpe", "m", "mean distance of the joints from the clip's, in the world"),
+        Metric("mpjpe", "m", "mean distance of the joints from the clip's, in the world (PHC's G-MPJPE)"),
+        Metric("local_mpjpe", "m", "the same with both pelvis joints at one place (PHC's MPJPE)"),
+        Metric("acceleration_error", "mm/frame^2", "mean error of the joints' accelerations (PHC's), frames are steps"),
         Metric("rotation_error_deg", "deg", "mean angle between the joints' local rotations and the clip's"),
         Metric("root_error", "m", "distance of the pelvis from the clip's"),
         Metric("impulse", "N s", "impulse that struck the body in this step, 0 for none"),
     )
-    state_arrays = (TaskArray("start", int), TaskArray("origin", wp.vec3))
+    state_arrays = (
+        TaskArray("playing", int),
+        TaskArray("start", int),
+        TaskArray("origin", wp.vec3),
+        TaskArray("errors", wp.vec3, (2, NUM_JOINTS), cleared=True),
+    )
     scratch_arrays = (
         TaskArray("reference_rotation", wp.quat, (NUM_JOINTS,)),
         TaskArray("reference_root", wp.vec3),
@@ -318,11 +363,13 @@ class TrackMotionTask(Task):
     )
     targets_about_reference = True
 
-    summary = """The reference pose follows a clip, and every `impulse_interval` an impulse of 0.3 to 1 times `impulse`
-and of random direction strikes trunk, head, shoulders, hips or left knee. Actions are added to the clip's own
-increments: with zero actions the commanded pose is the clip's, and a disturbance decays only as firmly as `tone` and
-the root wrench pull. A good agent steers against the disturbance and stays on the clip. With `control="torque"` or
-`"pd"` only the joints move the body, which begins with the clip's own velocity."""
+    summary = """The reference pose follows a clip (each episode draws one where `motion` names several), and every
+`impulse_interval` an impulse of 0.3 to 1 times `impulse` and of random direction strikes trunk, head, shoulders, hips
+or left knee. Actions are added to the clip's own increments: with zero actions the commanded pose is the clip's, and a
+disturbance decays only as firmly as `tone` and the root wrench pull. A good agent steers against the disturbance and
+stays on the clip. With `control="torque"` or `"pd"` only the joints move the body, which begins with the clip's own
+velocity. Files and folders of motions, their split and the figures that PHC reports:
+[avatars.md](../avatars.md#motions)."""
     success_doc = "`mpjpe` is at most `success_distance`"
     termination_doc = "`mpjpe` exceeds `fail_distance`"
     picture_seconds = 1.5
@@ -335,30 +382,30 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
         super().__init__(config)
         dt = config.physics.control_dt
         asset = load_avatar(config.avatar)
-        body = asset.shape(shape_parameters(asset, config.shape))
-        self.pelvis_height = float(body.joints[0, 2])
+        parameters = shape_parameters(asset, config.shape)
+        self.pelvis_height = float(asset.shape(parameters).joints[0, 2])
+        self.interval = max(1, round(config.impulse_interval / dt))
+        sampling = Sampling(dt, max(1, round(config.episode_seconds / dt)), config.random_start)
         try:
-            motion = load_motion(config.motion, asset, body)
+            mapping = None if config.motion_mapping is None else read_mapping(config.motion_mapping)
+            entries = chosen(find_motions(config.motion), config.split, config.held_out_share)
+            self.frames = load_frames(entries, asset, parameters, mapping, config.loop, sampling)
         except (ValueError, FileNotFoundError) as error:
             raise ConfigError(f"motion: {error}") from None
-        steps = max(1, round(config.episode_seconds / dt))
-        period = max(1, round(motion.duration / dt))
-        self.interval = max(1, round(config.impulse_interval / dt))
-        self.starts = period if config.random_start and motion.loop else 1
-        frames = self.starts + steps + 2 if motion.loop else min(period, steps) + 2
-        self.rotations, self.roots = motion.sample(np.arange(frames) * dt)
 
     def drawn(self) -> tuple[Parameter, ...]:
         dt = self.config.physics.control_dt
         last = (self.interval - 1) * dt if self.config.impulse > 0.0 else 0.0
+        latest = float(self.frames.starts.max() - 1) * dt
         return (
-            Parameter("motion_start", "s", 0.0, (self.starts - 1) * dt, "where the episode enters the clip"),
+            Parameter("motion", "-", 0.0, len(self.frames.names) - 1.0, "index of the clip"),
+            Parameter("motion_start", "s", 0.0, latest, "where the episode enters the clip"),
             Parameter("impulse_offset", "s", 0.0, last, "time of the first interval that is over at the start"),
         )
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         dt = self.config.physics.control_dt
-        return Drawn(self.start, dt), Drawn(self.offset, dt)
+        return Drawn(self.playing), Drawn(self.start, dt), Drawn(self.offset, dt)
 
     def action_spec(self) -> ActionSpec:
         speed = self.config.control.joint_speed_limit
@@ -366,14 +413,12 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
 
     def domain(self) -> Domain:
         """Move the default box along the clip; random bodies may take longer steps than the body of the clip."""
-        ways = [
-            self.roots[s : s + len(self.roots) - self.starts + 1, :2] - self.roots[s, :2] for s in range(self.starts)
-        ]
-        way = np.concatenate(ways) * (LONGEST_LEGS if self.config.shape.randomize else 1.0)
+        least, most = self.frames.reach()
+        scale = LONGEST_LEGS if self.config.shape.randomize else 1.0
         box = Domain()
-        lower = (*(np.asarray(box.lower[:2]) + way.min(0)).tolist(), box.lower[2])
-        upper = (*(np.asarray(box.upper[:2]) + way.max(0)).tolist(), max(box.upper[2], self.roots[:, 2].max() + 1.3))
-        return Domain(lower, upper)
+        lower = (*(np.asarray(box.lower[:2]) + scale * least).tolist(), box.lower[2])
+        top = max(box.upper[2], self.frames.roots[:, 2].max() + 1.3)
+        return Domain(lower, (*(np.asarray(box.upper[:2]) + scale * most).tolist(), top))
 
     def impulses(self) -> dict[str, float]:
         """Return the impulse on any of the bones in :data:`STRUCK`."""
@@ -381,14 +426,16 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
 
     def allocate(self, env) -> None:
         device = env.device
-        xyzw = np.ascontiguousarray(self.rotations[..., [1, 2, 3, 0]], np.float32)
+        frames = self.frames
+        xyzw = np.ascontiguousarray(frames.rotations[..., [1, 2, 3, 0]], np.float32)
         self.clip = fill(
             Clip(),
             self.config,
             rotation=wp.array(xyzw, dtype=wp.quat, device=device),
-            root=wp.array(self.roots.astype(np.float32), dtype=wp.vec3, device=device),
+            root=wp.array(frames.roots.astype(np.float32), dtype=wp.vec3, device=device),
+            first=wp.array(frames.first.astype(np.int32), dtype=int, device=device),
+            starts=wp.array(frames.starts.astype(np.int32), dtype=int, device=device),
             pelvis_height=self.pelvis_height,
-            starts=self.starts,
         )
         controller = env.simulation.controllers[0]
         if isinstance(controller, TorqueController):  # torques could not reach the clip's speed at once
@@ -401,7 +448,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
             draw_start,
             (env.num_envs, NUM_JOINTS),
             [env.episodes, self.clip, env.simulation.avatar.body],
-            [self.start, self.origin, drive.command_rotation, drive.command_root],
+            [self.playing, self.start, self.origin, drive.command_rotation, drive.command_root],
         )
         graph.launch(draw_offset, env.num_envs, [env.episodes, self.interval], [self.offset])
         if isinstance(env.simulation.controllers[0], TorqueController):
@@ -413,7 +460,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
             advance_reference,
             (env.num_envs, NUM_JOINTS),
             [
-                self.clip, env.simulation.avatar.body, env.action_map, self.start, env.episodes,
+                self.clip, env.simulation.avatar.body, env.action_map, self.playing, self.start, env.episodes,
                 drive.command_rotation, drive.command_root,
             ],
             [self.reference_rotation, self.reference_root],
@@ -438,7 +485,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
         graph.launch(
             read_clip,
             (env.num_envs, NUM_JOINTS),
-            [self.clip, env.simulation.avatar.body, self.start, self.origin, env.episodes],
+            [self.clip, env.simulation.avatar.body, self.playing, self.start, self.origin, env.episodes],
             [self.clip_rotation, self.clip_root],
         )
 
@@ -457,7 +504,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
     def record_outcome(self, env, graph) -> None:
         self._record_clip(env, graph)
         inputs = [self.clip, env.bones[0], self.clip_rotation, self.clip_position, self.impulse, env.action]
-        graph.launch(judge, env.num_envs, inputs, [env.outcome])
+        graph.launch(judge, env.num_envs, inputs, [self.errors, env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_clip(env, graph)

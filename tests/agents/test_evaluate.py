@@ -13,10 +13,14 @@ from agents.evaluate import (
     by_push,
     evaluate,
     over_seeds,
+    play,
     zero_agent,
 )
 from agents.intervals import mean_and_interval, mean_over_seeds, share_interval, share_interval_over_seeds, wilson
 from agents.sb3.matches import seated
+from piavatar_envs.api.host import EpisodeHost
+from piavatar_envs.config import load_config
+from piavatar_envs.tasks import load_task
 
 
 def ones(observation):
@@ -95,6 +99,35 @@ def test_success_once_at_the_end_and_its_share(countdown):
     assert row["mean_distance_m"] == pytest.approx(0.5)
     assert row["failures"] == 0
     assert row["episodes"] == 4
+
+
+def test_tracking_is_measured_in_the_terms_of_phc(device):
+    """Two motions under strong pushes: figures of the steps until an episode is given up; it is followed if none is."""
+    task = load_task("PIAvatar/TrackMotion-v0")
+    settings = {"motion": ["idle", "kick"], "fidelity": "tiny", "episode_seconds": 0.4, "impulse": 120.0}
+    settings |= {"impulse_interval": 0.3, "fail_distance": 0.08}
+    host = EpisodeHost(task(load_config(task.Config, settings)), 6, device)
+    evaluation = play("zero", lambda seen: np.zeros((*seen.shape[:2], host.action_size), np.float32), host, 3)
+    lasted = [not episode.terminated for episode in evaluation.episodes]
+    assert 0 < sum(lasted) < 6
+    row = evaluation.row()
+    assert row["followed"] == pytest.approx(np.mean(lasted)) and row["followed_interval"][0] < row["followed"]
+    host.reset([3 + env for env in range(6)])
+    seen, playing = [[] for _ in range(6)], np.ones(6, bool)
+    while playing.any():
+        host.step(np.zeros((6, 1, host.action_size), np.float32))
+        metrics = host.read(lambda group: group.metrics)[:, 0]
+        for env in np.flatnonzero(playing):
+            seen[env].append(metrics[env])
+        playing &= ~host.find_ended()
+    means = np.mean([np.mean(steps, axis=0) for steps in seen], axis=0)
+    names = dict(zip(task.metric_names, means, strict=True))
+    assert row["g_mpjpe_mm"] == pytest.approx(1000.0 * names["mpjpe"], rel=1e-5)
+    assert row["mpjpe_mm"] == pytest.approx(1000.0 * names["local_mpjpe"], rel=1e-5)
+    assert row["acceleration_error_mm"] == pytest.approx(names["acceleration_error"], rel=1e-5)
+    summed = over_seeds([row, {**row, "followed": 0.0, "mpjpe_mm": 0.0}])
+    assert summed["followed"] == pytest.approx(row["followed"] / 2) and len(summed["followed_interval"]) == 2
+    assert summed["mpjpe_mm"] == pytest.approx(row["mpjpe_mm"] / 2)
 
 
 def test_wilsons_interval_is_scipys_and_is_not_empty_at_the_ends():

@@ -36,6 +36,8 @@ def run(script: str, env_id: str, seed: int, *rows: dict, seconds: float = 60.0)
 @pytest.fixture
 def runs() -> dict[str, dict]:
     """Two seeds and another script in one environment, and one run in another."""
+    followed = {"followed": 0.75, "followed_interval": [0.5, 0.9], "g_mpjpe_mm": 31.26, "mpjpe_mm": 20.0}
+    followed |= {"acceleration_error_mm": 3.0}
     pushes = {"by_push": [{"impulse_n_s": [0.0, 5.0], "episodes": 10, "lasted": 0.5, "lasted_interval": [0.2, 0.8]}]}
     return {
         "stand_0": run("rsl_rl.train", "Stand-v0", 0, row("trained", 80.0)),
@@ -45,7 +47,7 @@ def runs() -> dict[str, dict]:
             for key, value in run("pid.score", "Stand-v0", 0, row("PID", 40.0)).items()
             if key not in ("training_s", "train_steps")
         },
-        "push": run("sb3.train", "Push-v0", 0, row("trained", 10.0, **pushes)),
+        "push": run("sb3.train", "Push-v0", 0, row("trained", 10.0, **pushes, **followed)),
     }
 
 
@@ -102,7 +104,7 @@ def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     assert text.index("## Push-v0") < text.index("## Stand-v0")
     assert "| rsl_ppo | pd | solid | 2 | 10 | 85.0 (21.5 to 148.5) |" in text and "2 M steps, 70 s" in text
     assert "| sb3_ppo | pd | slipping | 1 |" in text and "| PID | torque | firm |" in text
-    assert "| 0 to 5 | 50% of 10 |" in text
+    assert "| 0 to 5 | 50% of 10 |" in text and "| sb3_ppo | pd | 75% (50% to 90%) | 31.3 | 20.0 | 3.0 |" in text
     assert "some GPU; commits abc." in text and "Zero actions and the PID agent have no seeds" in text
     with pytest.raises(SystemExit, match=r"error: .*nowhere"):
         scores.main([str(tmp_path / "nowhere")])

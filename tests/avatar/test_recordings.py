@@ -111,6 +111,16 @@ def test_files_that_are_no_motion_are_refused_in_one_line(tmp_path: Path, conten
         load_motion(tmp_path / "none.bvh")
 
 
+def test_what_is_no_file_of_a_motion_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"is a folder.*\.bvh"):
+        load_motion(tmp_path)
+    (tmp_path / "walk.fbx").write_bytes(b"Kaydara FBX Binary")
+    with pytest.raises(ValueError, match=r"walk\.fbx is no motion by its suffix"):
+        load_motion(tmp_path / "walk.fbx")
+    with pytest.raises(FileNotFoundError, match="no motion file or folder"):
+        load_motion(str(tmp_path / "walks"))
+
+
 def test_a_header_with_another_count_is_warned_of(tmp_path: Path, squat: Motion) -> None:
     path = write_bvh(tmp_path / "squat.bvh", squat, REST, Skeleton(), announced=squat.num_frames - 1)
     with pytest.warns(UserWarning, match=f"says {squat.num_frames - 1} frames, there are {squat.num_frames}"):

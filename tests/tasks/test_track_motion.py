@@ -150,10 +150,16 @@ def test_metrics_are_those_of_numpy(make_env):
     for seed in range(3):
         env.reset(seed=seed)
         rng = np.random.default_rng(seed)
+        errors = [np.zeros((NUM_JOINTS, 3))] * 2  # before an episode
         for _ in range(8):
             info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))[4]
             (local, _, joints), (clip_local, _, clip_joints) = tracked(env), clip_frame(env, 0)
-            distance = np.linalg.norm(joints - clip_joints, axis=1)
+            errors.append(joints - clip_joints)
+            distance = np.linalg.norm(errors[-1], axis=1)
+            apart = np.linalg.norm(errors[-1] - errors[-1][0], axis=1)
+            jerks = np.linalg.norm(errors[-1] - 2.0 * errors[-2] + errors[-3], axis=1)
+            assert info["local_mpjpe"] == pytest.approx(apart.mean(), abs=2e-5)
+            assert info["acceleration_error"] == pytest.approx(1000.0 * jerks.mean(), abs=0.05)
             turns = Rotation.from_matrix(clip_local.transpose(0, 2, 1) @ local).magnitude()
             assert info["mpjpe"] == pytest.approx(distance.mean(), abs=2e-5)
             assert info["root_error"] == pytest.approx(distance[0], abs=2e-5)
@@ -244,7 +250,7 @@ def test_under_torques_bodies_begin_as_fast_as_the_clip(make_batch, control):
     assert np.abs(turns).max() > 2.0
 
 
-@pytest.mark.parametrize("name", ["env.step_count", "task.start"])
+@pytest.mark.parametrize("name", ["env.step_count", "task.start", "task.playing"])
 def test_a_state_from_before_the_clip_begins_with_it(make_env, name):
     """Whatever a state says, no frame is read that the clip does not have."""
     env = make_env(TRACK, random_start=False)

@@ -31,6 +31,8 @@ RATES = 5.0, 1000.0  # [1/s] of motion capture
 ROOT_SPEED = 20.0  # [m/s] of a pelvis, beyond sprinters and falls
 JOINT_SPEED = 25.0  # [rad/s] of a joint, about that of a punch
 GROUND_WINDOW = 0.8  # [s] longer than most flights; other skeletons stand otherwise than ours, so contact drifts
+#: Endings of files that may be motions.
+SUFFIXES = (".bvh", ".glb", ".gltf", ".npz", ".txt", ".vrm")
 FILES = "an AMASS .npz, a .bvh, a .glb, .gltf or .vrm with animations, or a DeepMimic .txt file"
 
 
@@ -115,6 +117,11 @@ def load_motion(
     return motion.closed() if loop and not motion.loop and motion.meets_itself() else motion
 
 
+def clips_of(path: Path) -> list[str]:
+    """Return what is added to the path of a file to name each of its clips: nothing where it has one, or has none."""
+    return [""]
+
+
 def _load_file(path: Path, joints: np.ndarray, mapping: Mapping[str, str] | None) -> tuple[Motion, float | None]:
     """Return the motion of a file by its suffix, and the window of its ground level [s]."""
     suffix = path.suffix.lower()
@@ -122,6 +129,11 @@ def _load_file(path: Path, joints: np.ndarray, mapping: Mapping[str, str] | None
         motion = deepmimic.load_file(path, joints)
     elif suffix == ".bvh":
         motion = to_motion(read_bvh(path), joints, mapping)
+    elif suffix not in SUFFIXES and path.exists():
+        kind = "a folder, of which TrackMotion draws motions" if path.is_dir() else "no motion by its suffix"
+        raise ValueError(f"{path} is {kind}; give the path of {FILES}")
+    elif suffix not in SUFFIXES:
+        raise FileNotFoundError(f"no motion file or folder {path}")
     else:
         return _checked(str(path), amass.load_file(path, joints)), None
     return _checked(str(path), motion), GROUND_WINDOW

@@ -1,0 +1,152 @@
+"""TrackMotion on several motions: each episode follows one of them, and a split by name holds some out."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.motion import Motion, load_motion
+from piavatar_envs.avatar.motion.collection import (
+    Entry,
+    Sampling,
+    chosen,
+    find_motions,
+    load_all,
+    place_in_split,
+    sample_frames,
+)
+from piavatar_envs.config import ConfigError
+from tests.avatar.skeletons import Skeleton, write_bvh
+from tests.tasks.measured import still
+
+TRACK = "PIAvatar/TrackMotion-v0"
+WALK_0 = 0.636576779487609  # on every machine
+DT = 1.0 / 30.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A folder with clips of half a second and of a second, and files that are no motions."""
+    folder = tmp_path_factory.mktemp("motions")
+    rest = load_asset().joints.astype(np.float64)
+    for name, clip, frames in (("short", "kick", 16), ("below/long", "arm_wave", 31)):
+        motion = load_motion(clip).resample(30.0)
+        part = Motion(name, 30.0, motion.local_rotations[20 : 20 + frames], motion.root_position[20 : 20 + frames])
+        (folder / name).parent.mkdir(exist_ok=True)
+        write_bvh(folder / f"{name}.bvh", part, rest, Skeleton())
+    np.savez(folder / "shape.npz", betas=np.zeros(10))
+    (folder / "notes.md").write_text("nothing")
+    return folder
+
+
+def test_every_episode_follows_one_of_the_motions(make_batch, folder):
+    with pytest.warns(UserWarning, match=r"1 of 4 files are left out: .*shape\.npz"):
+        batch = make_batch(TRACK, 24, motion=("squat", str(folder)), impulse=0.0)
+    names = batch.task.frames.names
+    assert names == ("squat", "below/long.bvh", "short.bvh")
+    places = ["squat", str(folder / "below/long.bvh"), str(folder / "short.bvh")]
+    motions = [load_motion(place) for place in places]
+    batch.reset(seeds=np.arange(24))
+    playing, start = batch.task.playing.numpy(), batch.task.start.numpy()
+    assert np.bincount(playing, minlength=3).min() > 2 and not start[playing > 0].any() and start[playing == 0].any()
+    rest = load_asset().joints.astype(np.float64)
+    for step in range(40):  # beyond the ends of the files, whose last poses are held
+        batch.action.zero_()
+        batch.step()
+        positions, mpjpe = batch.simulation.avatar.tracked.position.numpy(), batch.metrics.numpy()[:, 0, 0]
+        assert mpjpe.max() < 0.03
+        for e in (0, 5, 11) if step % 13 == 0 else ():
+            motion, begin = motions[playing[e]], start[e] * DT
+            pose, root = motion.sample(begin + (step + 1) * DT)
+            frame = Motion("now", 30.0, np.stack([pose] * 2), np.stack([root] * 2))
+            joints = frame.joint_frames(rest)[1][0] - motion.sample(begin)[1] * [1.0, 1.0, 0.0]
+            assert np.linalg.norm(positions[e] - joints, axis=1).mean() == pytest.approx(mpjpe[e], abs=2e-4)
+    again = make_batch(TRACK, 24, motion=("squat", str(folder)), impulse=0.0)
+    again.reset(seeds=np.arange(24))
+    assert np.array_equal(again.task.playing.numpy(), playing)
+
+
+def test_a_part_of_a_folder_is_held_out(make_env, folder):
+    places = {name: place_in_split(name) for name in ("below/long.bvh", "short.bvh")}
+    share = sum(places.values()) / 2  # one to each side
+    kept = {}
+    for split in ("train", "held_out"):
+        env = make_env(TRACK, motion=f"{folder}/", split=split, held_out_share=share, impulse=0.0)
+        kept[split] = list(env.batch.task.frames.names)
+    assert kept == {
+        "train": [max(places, key=places.get)],
+        "held_out": [min(places, key=places.get)],
+    }
+    with pytest.raises(ConfigError, match="split='held_out' has none of the 1 motions"):
+        make_env(TRACK, motion="squat", split="held_out", held_out_share=0.0)
+
+
+def test_a_split_depends_on_names_only():
+    entries = [Entry(f"walk_{n}.bvh", f"/somewhere/walk_{n}.bvh") for n in range(2000)]
+    train, held_out = (chosen(entries, split, 0.2) for split in ("train", "held_out"))
+    assert len(held_out) == pytest.approx(400, abs=4 * np.sqrt(2000 * 0.16))
+    assert {*train} | {*held_out} == {*entries} and not {*train} & {*held_out}
+    assert chosen(entries[::-1], "held_out", 0.2) == held_out[::-1]
+    assert {*held_out} < {*chosen(entries, "held_out", 0.3)}  # a greater share adds to it
+    assert place_in_split("walk_0.bvh") == pytest.approx(WALK_0, abs=1e-12)
+
+
+def test_folders_without_motions_are_refused(make_env, tmp_path, folder):
+    with pytest.raises(ConfigError, match="has no motions"):
+        make_env(TRACK, motion=str(tmp_path))
+    shutil.copy(folder / "shape.npz", tmp_path / "shape.npz")
+    with pytest.raises(ConfigError, match="none of 1 files can be read"):
+        make_env(TRACK, motion=str(tmp_path))
+    with pytest.raises(ConfigError, match=r"shape\.npz"):
+        make_env(TRACK, motion=("squat", str(tmp_path / "shape.npz")))
+
+
+def test_named_files_must_be_motions(folder):
+    names, motions = load_all([Entry("squat", "squat")], load_motion)
+    assert names == ["squat"] and motions[0].name == "squat"
+    with pytest.raises(ValueError, match="shape"):
+        load_all([Entry("shape.npz", str(folder / "shape.npz"))], load_motion)
+    assert find_motions(["kick", str(folder)])[0] == Entry("kick", "kick")
+
+
+def test_frames_of_loops_and_of_long_clips_allow_starts_anywhere():
+    loop = load_motion("squat")  # 2.6 s
+    long = Motion("long", loop.fps, loop.local_rotations, loop.root_position * [0.0, 0.0, 1.0] + walk(loop), loop=False)
+    frames = sample_frames(["a", "b"], [loop, long], Sampling(DT, 30, True))
+    period = round(loop.duration / DT)
+    assert frames.starts.tolist() == [period, period - 30 + 1]
+    assert frames.first.tolist() == [0, period + 32, period + 32 + period + 2]
+    np.testing.assert_allclose(frames.roots[frames.first[1] + 10], long.sample(10 * DT)[1])
+    np.testing.assert_allclose(frames.roots[frames.first[1] - 1], loop.sample((period + 31) * DT)[1], atol=1e-9)
+    ways = []
+    for first, end, starts in zip(frames.first, frames.first[1:], frames.starts, strict=False):
+        own = frames.roots[first:end, :2]
+        ways += [own[s : s + len(own) - starts + 1] - own[s] for s in range(starts)]
+    least, most = frames.reach()
+    np.testing.assert_array_equal(least, np.concatenate(ways).min(axis=0))
+    np.testing.assert_array_equal(most, np.concatenate(ways).max(axis=0))
+    assert sample_frames(["a", "b"], [loop, long], Sampling(DT, 30, False)).starts.tolist() == [1, 1]
+
+
+def walk(motion: Motion) -> np.ndarray:
+    """Return a way of 1 m/s along -y, ``(num_frames, 3)``."""
+    return np.outer(np.arange(motion.num_frames) / motion.fps, [0.0, -1.0, 0.0])
+
+
+def test_a_state_knows_the_files_of_its_folder(make_env, folder, tmp_path):
+    own = tmp_path / "own"
+    shutil.copytree(folder, own, ignore=shutil.ignore_patterns("shape.npz"))
+    env = make_env(TRACK, motion=str(own), impulse=0.0)
+    env.reset(seed=0)
+    state = env.get_state()
+    env.set_state(state)
+    assert np.isfinite(env.step(still(env))[0]).all()
+    (own / "short.bvh").unlink()
+    other = make_env(TRACK, twin=1, motion=str(own), impulse=0.0)
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match="motion"):
+        other.set_state(state)
