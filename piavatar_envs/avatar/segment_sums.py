@@ -255,18 +255,26 @@ def chunk_corrections(
     center: wp.array2d(dtype=wp.vec3),
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
+    jump: wp.array2d(dtype=wp.vec3),
     e: int,
     share: wp.vec4i,
     # out
     corrections: wp.array2d(dtype=vec12),
+    jumps: wp.array2d(dtype=vec8),
 ):
-    """Sum the momenta of pulls and lean in one chunk, linear and angular about the bone's centre."""
+    """Sum the momenta of pulls and lean in one chunk, linear and angular about the bone's centre.
+
+    If ``jumps`` has columns, sum those of commanded changes of velocity too.
+    """
     origin = center[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
+    held = jumps.shape[1] > 0
     p1 = wp.vec3()
     l1 = wp.vec3()
     p2 = wp.vec3()
     l2 = wp.vec3()
+    p3 = wp.vec3()
+    l3 = wp.vec3()
     last = share[3] - 1
     n = share[2]
     while n <= last:
@@ -280,9 +288,15 @@ def chunk_corrections(
             a = w * vector_at(lean, e, p)
             p2 += a
             l2 += wp.cross(d, a)
+            if held:
+                a = w * vector_at(jump, e, p)
+                p3 += a
+                l3 += wp.cross(d, a)
             n += share[1] >> 8
     total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
     store_one(corrections, e, share, total)
+    if held:
+        store_wrench(jumps, e, share, vec8(p3[0], p3[1], p3[2], l3[0], l3[1], l3[2], 0.0, 0.0))
 
 
 @wp.kernel(launch_bounds=(BLOCK, 9))
@@ -300,45 +314,11 @@ def sum_corrections(
     corrections: wp.array2d(dtype=vec12),
     jumps: wp.array2d(dtype=vec8),
 ):
-    """Run :func:`chunk_corrections` and, if ``jumps`` has columns, :func:`chunk_jumps` for every chunk.
-
-    Over ``(num_envs, warps of the quarters, threads)``.
-    """
+    """Run :func:`chunk_corrections` for every chunk, over ``(num_envs, warps of the quarters, threads)``."""
     i, j, k = wp.tid()
     e, share = own_share(body.quarters, i, j, k, threads)
     if failure[e] == 0:
-        chunk_corrections(body, particles, x, center, pull, lean, e, share, corrections)
-        if jumps.shape[1] > 0:
-            chunk_jumps(body, particles, x, center, jump, e, share, jumps)
-
-
-@wp.func
-def chunk_jumps(
-    body: Body,
-    particles: Particles,
-    x: wp.array2d(dtype=wp.vec3),
-    center: wp.array2d(dtype=wp.vec3),
-    jump: wp.array2d(dtype=wp.vec3),
-    e: int,
-    share: wp.vec4i,
-    # out
-    jumps: wp.array2d(dtype=vec8),
-):
-    """Sum the momenta of commanded changes of velocity in one chunk, like :func:`chunk_corrections`."""
-    origin = center[e, share[1] & 255]
-    r = row(e, particles.mass.shape[0])
-    P = wp.vec3()
-    L = wp.vec3()
-    last = share[3] - 1
-    n = share[2]
-    while n <= last:
-        for _ in range(AT_ONCE):
-            p, weight = entry_of(body, n, last)
-            a = (weight * number_at(particles.mass, r, body.first + p)) * vector_at(jump, e, p)
-            P += a
-            L += wp.cross(vector_at(x, e, body.first + p) - origin, a)
-            n += share[1] >> 8
-    store_wrench(jumps, e, share, vec8(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0))
+        chunk_corrections(body, particles, x, center, pull, lean, jump, e, share, corrections, jumps)
 
 
 @wp.func

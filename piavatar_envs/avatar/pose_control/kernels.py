@@ -29,7 +29,6 @@ from piavatar_envs.avatar.pose_control.root import axial, free_motion, hold_root
 from piavatar_envs.avatar.segment_sums import (
     add_chunks,
     chunk_corrections,
-    chunk_jumps,
     chunk_moments,
     chunk_motion,
     share_of,
@@ -134,9 +133,7 @@ def command_body(
     remove_motion(body, control, w, root, e, 0, 1)
     for c in range(chunks):
         share = share_of(body.quarters, c, 0)
-        chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, e, share, w.corrections)
-        if control.root_rate > 0.0:
-            chunk_jumps(body, particles, x, w.bones.center, w.jump, e, share, w.jumps)
+        chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, w.jump, e, share, w.corrections, w.jumps)
     correct_bones(body, control, 1, w, root, e, 0, 1)
     for p in range(body.count):
         at = vector_at(x, e, body.first + p)
