@@ -66,16 +66,21 @@ def correction_rate(body: Body, per_time: float, e: int, p: int):
 
 
 @wp.func
+def with_joint(displacement: wp.vec3, linear: wp.mat33, quadratic: wp.mat33, q: wp.quat):
+    """Return a ``displacement`` [m] with that by a joint turned by ``q``, by its coefficients for the particle."""
+    v = wp.vec3(q[0], q[1], q[2])
+    return displacement + (2.0 * q[3]) * (linear * v) + 2.0 * (quadratic * wp.cw_mul(v, v))
+
+
+@wp.func
 def displacement_of(body: Body, rotation: wp.array2d(dtype=wp.quat), e: int, p: int):
     """Return the displacement of a particle for joints with these local rotations [m]."""
     total = wp.vec3()
     own = p - body.alone
-    if own >= 0 and own + 1 < body.correctives.start.shape[0]:
-        for i in range(body.correctives.start[own], body.correctives.start[own + 1]):
-            q = rotation[e, body.correctives.joint[i]]
-            v = wp.vec3(q[0], q[1], q[2])
-            total += (2.0 * q[3]) * (body.correctives.linear[i] * v)
-            total += 2.0 * (body.correctives.quadratic[i] * wp.cw_mul(v, v))
+    c = body.correctives
+    if own >= 0 and own + 1 < c.start.shape[0]:
+        for i in range(c.start[own], c.start[own + 1]):
+            total = with_joint(total, c.linear[i], c.quadratic[i], rotation[e, c.joint[i]])
     return total
 
 
@@ -96,9 +101,17 @@ def begin_corrections(
 ):
     """Set displacements for local rotations ``before``, and their change until those ``after``; as many threads."""
     e, p = wp.tid()
-    begin = displacement_of(body, before, e, body.alone + p)
-    body.correctives.displacement[e, p] = begin
-    body.correctives.change[e, p] = displacement_of(body, after, e, body.alone + p) - begin
+    c = body.correctives
+    begin = wp.vec3()
+    end = wp.vec3()
+    for i in range(c.start[p], c.start[p + 1]):  # both in one pass, because the coefficients are what takes time
+        linear = c.linear[i]
+        quadratic = c.quadratic[i]
+        joint = c.joint[i]
+        begin = with_joint(begin, linear, quadratic, before[e, joint])
+        end = with_joint(end, linear, quadratic, after[e, joint])
+    c.displacement[e, p] = begin
+    c.change[e, p] = end - begin
 
 
 @wp.kernel
