@@ -54,8 +54,8 @@ def short_of_pi(v: wp.vec3):
 
 
 @wp.func
-def torque_of_vector(v: wp.vec3, pull: wp.vec3):
-    """Return the torque that does the work of ``pull`` on a rotation vector ``v``: ``J_l(v)^-T pull``.
+def torques_of_vector(v: wp.vec3):
+    """Return ``J_l(v)^-T``: its columns are the torques that do the work of unit pulls on a rotation vector ``v``.
 
     A rotation by ``dt w``, after that of ``v``, changes ``v`` by ``dt J_l(v)^-1 w``, with the left Jacobian of SO(3)
     (Barfoot, "State Estimation for Robotics", 2017, section 7.1). Along ``v`` both are the same.
@@ -64,8 +64,8 @@ def torque_of_vector(v: wp.vec3, pull: wp.vec3):
     c = 1.0 / 12.0 + half * half / 180.0
     if half > 0.05:
         c = (1.0 - half * wp.cos(half) / wp.sin(half)) / (4.0 * half * half)
-    turned = wp.cross(v, pull)
-    return pull + 0.5 * turned + c * wp.cross(v, turned)
+    X = wp.skew(v)
+    return wp.identity(n=3, dtype=float) + 0.5 * X + c * (X * X)
 
 
 @wp.func

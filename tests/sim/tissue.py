@@ -7,7 +7,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import PARENTS
-from piavatar_envs.avatar.rotation import torque_of_vector
+from piavatar_envs.avatar.rotation import torques_of_vector
 from piavatar_envs.avatar.torque_control.joint_tissue import Tissue, tissue_pull
 
 
@@ -15,7 +15,7 @@ from piavatar_envs.avatar.torque_control.joint_tissue import Tissue, tissue_pull
 def find_tissue_torques(tissue: Tissue, factor: wp.array(dtype=float), bend: wp.array2d(dtype=wp.vec3),
                         torque: wp.array2d(dtype=wp.vec3)):  # fmt: skip
     e, b = wp.tid()
-    torque[e, b] = torque_of_vector(bend[e, b], tissue_pull(tissue, bend, factor[0], e, b))
+    torque[e, b] = torques_of_vector(bend[e, b]) * tissue_pull(tissue, bend, factor[0], e, b)
 
 
 def tissue_torques(batch) -> np.ndarray:

@@ -3,14 +3,15 @@
 The range of a joint bounds the three components of its rotation vector ``v``, and its length. A bound along the axis
 ``a`` holds at the end of a substep if the joint's spin ``w`` relative to its parent, in the world's axes, satisfies
 
-    n . w <= (bound - a . v) / dt,   n = R J_l(v)^-T a,
+    n . w <= (bound - a . v) / dt,   n = A a,   A = R J_l(v)^-T,
 
 with the rotation ``R`` of the parent and the left Jacobian ``J_l`` of SO(3)
-(:func:`~piavatar_envs.avatar.rotation.torque_of_vector`). Where the solution breaks a bound, the joint is held along
-``n``: an inertia ``mu n n^T``, :data:`HOLD` times that of what the joint moves, is added to the matrix, and ``mu n``
-times the allowed change to the right-hand side. The system is factorized and solved again, so that all joints respond
-to all stops at once, and a blow on a limb reaches the trunk in the same substep. A stop that pulls is released, and the
-next solution is computed without it (an active-set method; Nocedal & Wright, "Numerical Optimization", 2006, ch. 16.5).
+(:func:`~piavatar_envs.avatar.rotation.torques_of_vector`); ``A^T w`` is the rate of ``v``. Where the solution breaks a
+bound, the joint is held along ``n``: an inertia ``mu n n^T``, :data:`HOLD` times that of what the joint moves, is added
+to the matrix, and ``mu n`` times the allowed change to the right-hand side. The system is factorized and solved again,
+so that all joints respond to all stops at once, and a blow on a limb reaches the trunk in the same substep. A stop that
+pulls is released, and the next solution is computed without it (an active-set method; Nocedal & Wright, "Numerical
+Optimization", 2006, ch. 16.5).
 
 Stops act between a bone and its parent, do not rebound, and keep momentum.
 """
@@ -19,7 +20,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, torque_of_vector
+from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, torques_of_vector
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple, triple_of
 from piavatar_envs.avatar.torque_control.joint_tissue import Tissue, above, beyond
 from piavatar_envs.avatar.torque_control.tree_cholesky import Pattern
@@ -50,11 +51,12 @@ class Stops:
 
 
 @wp.func
-def allowed_rate(way: float, dt: float):
-    """Return the greatest rate towards an end that is ``way`` [rad] away: negative where it has been passed."""
-    if way >= 0.0:
-        return way / dt
-    return wp.max(_BACK_SHARE * way / dt, -_BACK_SPEED)
+def allowed_rate(way: float, per_time: float):
+    """Return the greatest rate towards an end that is ``way`` [rad] away: negative where it has been passed.
+
+    ``per_time`` is one over a substep [1/s].
+    """
+    return wp.max(wp.where(way < 0.0, _BACK_SHARE, 1.0) * per_time * way, -_BACK_SPEED)
 
 
 @wp.func
@@ -108,11 +110,14 @@ def hold_joint(
     frame = above(body, pose.rotation, e, b)
     v = quat_log(wp.quat_inverse(frame) * pose.rotation[e, b])
     angle = wp.length(v)
-    before = triple_of(q, e, 3 + 3 * b) + triple_of(outside, e, 3 + 3 * b)
-    after = before + triple_of(change, row_of_change, 3 + 3 * b)
+    A = wp.quat_to_matrix(frame) * torques_of_vector(v)
+    spin = triple_of(q, e, 3 + 3 * b) + triple_of(outside, e, 3 + 3 * b)
+    before = spin * A
+    after = (spin + triple_of(change, row_of_change, 3 + 3 * b)) * A
+    per_time = 1.0 / dt
     old = stops.held[e, b]
     held = int(0)
-    block = wp.mat33()
+    block = wp.mat33()  # in the components of v
     impulse = wp.vec3()
     for i in range(_BOUNDS):
         axis = wp.vec3()
@@ -120,18 +125,18 @@ def hold_joint(
         high = MAX_ANGLE - angle
         if i < 3:
             axis[i] = 1.0
-            low = -allowed_rate(v[i] - tissue.lower[b][i], dt)
+            low = -allowed_rate(v[i] - tissue.lower[b][i], per_time)
             high = tissue.upper[b][i] - v[i]
         elif angle > 0.5 * MAX_ANGLE:
             axis = v / angle
-        high = allowed_rate(high, dt)
-        n = wp.quat_rotate(frame, torque_of_vector(v, axis))
-        end = end_that_holds(wp.dot(n, after), high, low, (old >> (2 * i)) & 3)
+        high = allowed_rate(high, per_time)
+        end = end_that_holds(wp.dot(axis, after), high, low, (old >> (2 * i)) & 3)
         if end != 0:
             held = held | (end << (2 * i))
-            rate = wp.where(end == _UPPER, high, low) - wp.dot(n, before)
-            block += HOLD * inertia * wp.outer(n, n)
-            impulse += HOLD * inertia * rate * n
+            block += wp.outer(axis, axis)
+            impulse += (wp.where(end == _UPPER, high, low) - wp.dot(axis, before)) * axis
+    block = (HOLD * inertia) * (A * block * wp.transpose(A))
+    impulse = (HOLD * inertia) * (A * impulse)
     set_triple(right, e, 3 + 3 * b, triple_of(right, e, 3 + 3 * b) + impulse - stops.impulse[e, b])
     stops.held[e, b] = held
     stops.inertia[e, b] = block
@@ -183,8 +188,8 @@ def stay_in_range(
     local = wp.quat_inverse(frame) * pose.rotation[e, b]
     turn = time * wp.quat_rotate_inv(frame, triple_of(q, row, 3 + 3 * b))
     v = quat_log(quat_exp(turn) * local)
-    off = beyond(local, tissue.lower[b], tissue.upper[b])
-    back = beyond(quat_exp(v), tissue.lower[b], tissue.upper[b])
+    off = beyond(quat_log(local), tissue.lower[b], tissue.upper[b])
+    back = beyond(v, tissue.lower[b], tissue.upper[b])
     if wp.length_sq(back) > wp.length_sq(off):
         kept = quat_log(quat_exp(v + back - off) * wp.quat_inverse(local))
         set_triple(q, row, 3 + 3 * b, wp.quat_rotate(frame, kept) / time)

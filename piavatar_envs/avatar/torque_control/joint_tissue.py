@@ -1,7 +1,7 @@
 """Tissue of the joints: passive moments of muscles and ligaments, resistance of bent flesh, and the ends of ranges.
 
 Moments are minus the gradient of an energy of the joints' rotation vectors ``q`` relative to the rest pose, which
-:func:`~piavatar_envs.avatar.rotation.torque_of_vector` turns into torques: passive moments of
+:func:`~piavatar_envs.avatar.rotation.torques_of_vector` turns into torques: passive moments of
 :mod:`piavatar_envs.avatar.body.passive`, of the size of the body, and the flesh's of
 :mod:`piavatar_envs.avatar.body.flesh_stiffness`, which couples neighbouring joints.
 """
@@ -121,13 +121,12 @@ def above(body: Body, rotation: wp.array2d(dtype=wp.quat), e: int, b: int):
 
 
 @wp.func
-def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
-    """Return the change of the rotation vector that leads back into the range [rad]; zero within it.
+def beyond(v: wp.vec3, lower: wp.vec3, upper: wp.vec3):
+    """Return the change of the rotation vector ``v`` that leads back into the range [rad]; zero within it.
 
     The range ends before half a turn, even at the corners of the box: there rotation vectors jump, and a stop would
     push outwards.
     """
-    v = quat_log(local)
     return short_of_pi(wp.max(lower, wp.min(v, upper))) - v
 
 
@@ -169,11 +168,12 @@ def share_of_joint(tissue: Tissue, k: int, b: int):
 @wp.func
 def moment_along(tissue: Tissue, v: wp.vec3, b: int, i: int):
     """Return the passive moment towards the rest pose about an axis [N m], and its slope [N m/rad]."""
-    if v[i] < 0.0:
-        low = growing_moment(-v[i], -tissue.lower[b][i], tissue.lower_moment[b][i], tissue.lower_rate[b][i])
-        return wp.vec2(low[0], low[1])
-    high = growing_moment(v[i], tissue.upper[b][i], tissue.upper_moment[b][i], tissue.upper_rate[b][i])
-    return wp.vec2(-high[0], high[1])
+    low = v[i] < 0.0
+    end = wp.where(low, -tissue.lower[b][i], tissue.upper[b][i])
+    moment = wp.where(low, tissue.lower_moment[b][i], tissue.upper_moment[b][i])
+    rate = wp.where(low, tissue.lower_rate[b][i], tissue.upper_rate[b][i])
+    grown = growing_moment(wp.abs(v[i]), end, moment, rate)
+    return wp.vec2(wp.where(low, grown[0], -grown[0]), grown[1])
 
 
 @wp.func

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.rotation import quat_log, torque_of_vector
+from piavatar_envs.avatar.rotation import quat_log, torques_of_vector
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple, triple_of
 from piavatar_envs.avatar.torque_control.joint_tissue import (
     Tissue,
@@ -151,7 +151,7 @@ def joint_impulse(
         if b > 0:
             factor = target.factor[row(e, target.factor.shape[0])]
             push += factor * target.torque[e, b]
-            pull = torque_of_vector(bend[e, b], tissue_pull(tissue, bend, factor, e, b))
+            pull = torques_of_vector(bend[e, b]) * tissue_pull(tissue, bend, factor, e, b)
             passive = dt * wp.quat_rotate(frame, pull)
             damping = tissue_damping(tissue, stiffness[e, b], factor, b)
             passive -= implicit_inertia(dt, stiffness[e, b], damping) * v

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field
 
 from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.skeleton import Bounds, joint_index
-from piavatar_envs.avatar.rotation import quat_exp
+from piavatar_envs.avatar.rotation import quat_exp, quat_log
 from piavatar_envs.avatar.torque_control.joint_tissue import beyond
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import FROZEN, ConfigError
@@ -249,7 +249,7 @@ def posture_excess(gait: Gait, bones: Bones, e: int):
     count = gait.joint.shape[0]
     total = float(0.0)
     for n in range(count):
-        total += wp.length_sq(beyond(bones.local[e, gait.joint[n]], gait.lower[n], gait.upper[n]))
+        total += wp.length_sq(beyond(quat_log(bones.local[e, gait.joint[n]]), gait.lower[n], gait.upper[n]))
     return total / float(3 * count)
 
 
