@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -43,8 +44,8 @@ _LEFT, _RIGHT = wp.constant(joint_index("left_ankle")), wp.constant(joint_index(
 _FEET_BOUND = wp.constant(0.25)
 #: Lead of the assisted pelvis' target: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
-#: Room to each side, besides that of a fall: bodies that have got up seldom stand still at once [m].
-ASIDE = 3.0
+#: Room to each side before a wall, besides that of a held body: bodies that have got up seldom stand still at once [m].
+ASIDE = 4.2
 
 #: Turns about x from the rest pose [rad], of left and right joints alike; of the pelvis from upright.
 _Pose = Mapping[str, float]
@@ -277,9 +278,9 @@ class GetUpTask(Task):
 its arms beside it, its joints up to `pose_noise` off that pose. A share of episodes, `halfway`, begins on the way up
 instead, as a curriculum: on all fours or on a knee, sitting or squatting, or half up. The avatar must stand up to the
 rest pose by the strength of its joints, and stay there for `hold_seconds`. Only the clock ends an episode; a fall costs
-time. The place where it stands in the end does not matter. Here `root_assist` leads the pelvis upwards and towards
-upright, from wherever it is. With `control="pose"` the root wrench keeps the pelvis where it lies, and there is nothing
-to learn."""
+time. The place where it stands in the end does not matter; smooth walls are six metres away. Here `root_assist` leads
+the pelvis upwards and towards upright, from wherever it is. With `control="pose"` the root wrench keeps the pelvis
+where it lies, and there is nothing to learn."""
     success_doc = f"for `hold_seconds` without a break {STANDING_DOC}"
     picture_seconds = 1.0
     picture_actions = "zero"
@@ -288,7 +289,8 @@ to learn."""
 
     def domain(self) -> Domain:
         places = [avatar.position for avatar in self.scene.avatars]
-        return Domain().around([(x + way, y + way) for x, y, *_ in places for way in (-ASIDE, ASIDE)])
+        room = Domain().around([(x + way, y + way) for x, y, *_ in places for way in (-ASIDE, ASIDE)])
+        return replace(room, fenced=True)  # there is no way out of the episode by crawling
 
     def allocate(self, env) -> None:
         config = self.config

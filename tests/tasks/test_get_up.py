@@ -167,3 +167,16 @@ def test_there_is_room_to_wander(make_env):
         _, _, terminated, _, info = env.step(still(env))
         assert not terminated and info["failure"] == 0
     np.testing.assert_allclose(env.get_state()["particles.x"].mean(axis=(0, 1))[:2], away[:2], atol=0.3)
+
+
+def test_a_body_that_crawls_away_comes_to_a_wall(make_env):
+    """Dragged for six metres it is still in the episode; policies that crawl as far had failed."""
+    env = make_env(GET_UP, pose_noise=0.0)
+    env.reset(seed=0)
+    env.unwrapped.apply_force("pelvis", [900.0, 0.0, 0.0], steps=90)
+    places = []
+    for _ in range(90):
+        _, _, terminated, _, info = env.step(still(env))
+        assert not terminated and info["failure"] == 0
+        places.append(pelvis(env)[0][0])
+    assert 5.0 < places[-1] < 6.0 and max(places[-5:]) - min(places[-5:]) < 0.05
