@@ -1,6 +1,6 @@
 """Write a model with the layout of SMPL-X, SMPL-H or SMPL, made from the embedded body (MakeHuman, CC0).
 
-It serves tests, benchmarks and a first try without a licence; it is not SMPL: the shapes are the embedded body's, and the
+It serves tests, benchmarks and a first try without a licence. It is not SMPL: shapes are the embedded body's, and
 pose displacements are bulges of bent joints. Like SMPL-X it has 10,475 vertices, 9,383 of a skin with open eyes and
 twice 546 of an eyeball::
 

@@ -125,7 +125,7 @@ def _named(name: str) -> type[Stub] | Stub:
 
 
 def _made(called: Any, arguments: Any) -> Any:
-    """Return the stub of a call that the pickle asks for; bytes of text are returned at once."""
+    """Return the stub of a call in the pickle; bytes of text are returned at once."""
     if not isinstance(called, Stub) or called.arguments is not None or not isinstance(arguments, tuple):
         raise ValueError("the pickle calls something that has no name")
     if called.name == "_codecs.encode":

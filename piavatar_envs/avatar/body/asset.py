@@ -48,6 +48,19 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
+class SkeletonPoints:
+    """Points of a skeleton's surface.
+
+    Attributes:
+        points: in the reference pose of the mean shape [m], shape ``(K, 3)``.
+        bone: the joint that each moves with, shape ``(K,)`` int32.
+    """
+
+    points: np.ndarray
+    bone: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class AvatarAsset:
     """A skinned, shapeable body. Axes: metres, z up, facing -y, its left is +x; joints as in ``skeleton.py``.
 
@@ -65,6 +78,7 @@ class AvatarAsset:
         shape_deltas: vertex displacements at -1 and at +1 of each parameter [m], shape ``(S, 2, V, 3)`` float32.
         shape_joints: joint displacements, the same way [m], shape ``(S, 2, 22, 3)`` float32.
         look: the surface to draw; None draws the skin.
+        skeleton: where bone particles are put; None puts them around the bones' axes.
     """
 
     name: str
@@ -77,6 +91,7 @@ class AvatarAsset:
     shape_deltas: np.ndarray
     shape_joints: np.ndarray
     look: Look | None = None
+    skeleton: SkeletonPoints | None = None
 
     def shape(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
         """Return the body of shape parameters ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.

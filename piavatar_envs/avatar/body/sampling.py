@@ -2,7 +2,8 @@
 
 *Flesh* particles sit in the cells of a regular lattice, each at the centroid of the part of its cell that is inside the
 skin, so thin limbs are filled as well as thick ones. *Bone* particles are ordinary particles too, a small lattice along
-every bone, rigidly skinned to it: the Kabsch fit that tracks the pose reads only them.
+every bone, rigidly skinned to it: the Kabsch fit that tracks the pose reads only them. Where the asset has a skeleton,
+they are its points, one a cube of the lattice, and the small lattice fills up bones that have too few.
 
 Values are interpolated inside the body by harmonic functions on the graph of its particles. In memory neighbours should
 be neighbours in the body: then the threads of a warp access the same nodes of the grid, or blend the same bones.
@@ -19,8 +20,16 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody, dense_weights, mesh_volume, top_weights
+from piavatar_envs.avatar.body.asset import (
+    AvatarAsset,
+    ShapedBody,
+    SkeletonPoints,
+    dense_weights,
+    mesh_volume,
+    top_weights,
+)
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.skeleton_mesh import thinned
 
 wp.set_module_options({"enable_backward": False})
 
@@ -350,7 +359,9 @@ def spacing_for(dx: float) -> float:
 
 
 @lru_cache(maxsize=16)
-def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rings: int = 4) -> ParticleSet:
+def sample_particles(
+    asset: AvatarAsset, spacing: float, seed: int = 0, bone_rings: int = 4, bone_voxel: float = 1.0
+) -> ParticleSet:
     """Fill the mean shape of an asset with particles; the same on every call and machine.
 
     Args:
@@ -358,6 +369,7 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
         spacing: lattice spacing [m]; see :func:`spacing_for`.
         seed: shifts the lattice in y and z. Not in x, where it stays as symmetric as the body.
         bone_rings: rings of five bone particles along every bone.
+        bone_voxel: edge of the cubes that have one point of the asset's skeleton each, over the spacing.
 
     Raises:
         ValueError: the spacing is not positive or too coarse for the body, too few rings, or a bone outside the skin.
@@ -369,7 +381,7 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
         raise ValueError(f"bone_rings={bone_rings} gives under {MIN_BONE_PARTICLES} particles a bone; use 4 or more")
     skin = ClosedSurface(asset.vertices, asset.faces)
     flesh, interior = _flesh_lattice(asset, skin, spacing, seed)
-    bones, bone_of = _bone_lattice(asset, skin, bone_rings)
+    bones, bone_of = _bone_particles(asset, skin, bone_rings, spacing, bone_voxel)
     flesh = flesh[cKDTree(bones).query(flesh)[0] > BONE_CLEARANCE * spacing]
     positions = np.concatenate([bones, flesh]).astype(np.float32)
     bone = np.concatenate([bone_of, np.full(len(flesh), -1)]).astype(np.int32)
@@ -475,6 +487,31 @@ def _bone_starts(asset: AvatarAsset, ends: np.ndarray) -> np.ndarray:
         own = asset.vertices[asset.skin_joints[:, 0] == joint]
         starts[joint, 1:] = own[:, 1].max(initial=starts[joint, 1]), ends[joint, 2]
     return starts
+
+
+def _bone_particles(
+    asset: AvatarAsset, skin: ClosedSurface, rings: int, spacing: float, voxel: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return bone particles ``(B, 3)`` and the joint each belongs to ``(B,)``: of the skeleton, or of the lattice.
+
+    A bone with fewer than :data:`MIN_BONE_PARTICLES` points of the skeleton gets those of the lattice that are furthest
+    from them, and from each other.
+    """
+    lattice, owner = _bone_lattice(asset, skin, rings)
+    if asset.skeleton is None:
+        return lattice, owner
+    inside = skin.distance(asset.skeleton.points) < -INSET * spacing
+    skeleton = thinned(SkeletonPoints(asset.skeleton.points[inside], asset.skeleton.bone[inside]), voxel * spacing)
+    points = []
+    for joint in range(NUM_JOINTS):
+        own, spare = skeleton.points[skeleton.bone == joint], lattice[owner == joint]
+        if len(own) == 0:
+            own = spare[:1]
+        while len(own) < MIN_BONE_PARTICLES:
+            gap = np.linalg.norm(spare[:, None] - own, axis=2).min(axis=1)
+            own = np.append(own, spare[[gap.argmax()]], axis=0)
+        points.append(own)
+    return np.concatenate(points), np.repeat(np.arange(NUM_JOINTS), [len(own) for own in points])
 
 
 def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[np.ndarray, np.ndarray]:

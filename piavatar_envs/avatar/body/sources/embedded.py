@@ -8,6 +8,7 @@ import numpy as np
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.body.skeleton_mesh import read_skeleton
 
 
 def _merged_into_body(parents: np.ndarray) -> np.ndarray:
@@ -18,11 +19,14 @@ def _merged_into_body(parents: np.ndarray) -> np.ndarray:
     return body
 
 
-def build() -> AvatarAsset:
+def build(skeleton: str | None = None) -> AvatarAsset:
     """Return the embedded body.
 
+    Args:
+        skeleton: mesh of a skeleton, or a folder of its parts, in the body's place, pose and axes; for bone particles.
+
     Raises:
-        ValueError: the file has another skeleton.
+        ValueError: the file has another skeleton, or that of ``skeleton`` cannot be read.
     """
     file = resources.files("piavatar_envs.data").joinpath("body.npz")
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
@@ -44,4 +48,5 @@ def build() -> AvatarAsset:
         shape_names=names,
         shape_deltas=deltas.reshape(len(names), 2, *deltas.shape[1:]),
         shape_joints=data["shape_joints"][:, :NUM_JOINTS].reshape(len(names), 2, NUM_JOINTS, 3),
+        skeleton=None if skeleton is None else read_skeleton(skeleton, data["joints"][:NUM_JOINTS].astype(np.float64)),
     )
