@@ -105,7 +105,12 @@ class SceneReader:
             shaped = flesh.asset.shape_drawn(flesh.shape_parameters[env])
             self._skins = {other: skin for other, skin in self._skins.items() if other[0] != avatar}
             self._skins[key] = Skin.baked(
-                flesh.asset.drawn, shaped, points.rest[row], points.skin_joints, points.skin_weights
+                flesh.asset.drawn,
+                shaped,
+                points.rest[row],
+                points.skin_joints,
+                points.skin_weights,
+                points.correctives,
             )
         return self._skins[key]
 

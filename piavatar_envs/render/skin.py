@@ -2,20 +2,28 @@
 
 The particles fill the body; the skin mesh is not simulated. Each skin vertex therefore follows its bones, and adds
 the displacement ``x - LBS`` of the particles beneath it. Which particles, and with which weights, is baked once.
+
+A surface may have displacements of its own that depend on the pose. They then stand in place of those that particles
+are skinned with, see :mod:`piavatar_envs.avatar.body.pose_correctives`, which would count the same bulge twice.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.interpolation import interpolation_matrix
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+
+if TYPE_CHECKING:
+    from piavatar_envs.avatar.body.asset import PoseDisplacements
+    from piavatar_envs.avatar.body.pose_correctives import PoseCorrectives
 
 #: Particles that move a vertex. With few, what neighbours differ by crumples the skin where it is finer than they are:
 #: toes on the ground, between bones that are put into their places and flesh that is not.
@@ -50,6 +58,7 @@ class Skin:
         rest_positions: np.ndarray,
         skin_joints: np.ndarray,
         skin_weights: np.ndarray,
+        correctives: PoseCorrectives | None = None,
     ) -> None:
         """Bake the weights.
 
@@ -59,6 +68,7 @@ class Skin:
             rest_positions: the particles in the rest pose of that same shape [m], shape ``(P, 3)``.
             skin_joints: joints that move each particle, shape ``(P, K)`` int.
             skin_weights: their weights, rows sum to one, shape ``(P, K)``.
+            correctives: displacements of the particles' rest pose by the pose, if they have such.
 
         Raises:
             ValueError: there are no particles, or their arrays differ in length.
@@ -74,13 +84,12 @@ class Skin:
         self._rest_joints = np.asarray(body.joints, dtype=np.float64)
         self._vertex_skinning = _skinning_matrix(vertices, asset.skin_joints, asset.skin_weights)
         self._particle_skinning = _skinning_matrix(particles, skin_joints, skin_weights)
-        self._interpolation = interpolation_matrix(
-            vertices,
-            _joint_weights(asset.skin_joints, asset.skin_weights),
-            particles,
-            _joint_weights(skin_joints, skin_weights),
-            NUM_NEIGHBOURS,
-        )
+        own, others = (_joint_weights(asset.skin_joints, asset.skin_weights), _joint_weights(skin_joints, skin_weights))
+        self._interpolation = interpolation_matrix(vertices, own, particles, others, NUM_NEIGHBOURS)
+        self._pose = getattr(asset, "pose", None)
+        self._correctives = correctives
+        if self._pose is not None:
+            self._vertex_weights, self._particle_weights = sparse.csr_array(own), sparse.csr_array(others)
 
     @classmethod
     def baked(
@@ -90,15 +99,18 @@ class Skin:
         rest_positions: np.ndarray,
         skin_joints: np.ndarray,
         skin_weights: np.ndarray,
+        correctives: PoseCorrectives | None = None,
     ) -> Skin:
         """Return the skin of these arrays, baked once a process for all environments; arguments as for the class."""
         digest = hashlib.blake2b()
         surface = (asset.skin_joints, asset.skin_weights, body.vertices, body.joints)
-        for array in (*surface, rest_positions, skin_joints, skin_weights):
+        pose: PoseDisplacements | None = getattr(asset, "pose", None)
+        moved = () if pose is None else (pose.directions, pose.reference)
+        for array in (*surface, rest_positions, skin_joints, skin_weights, *moved):
             digest.update(f"{np.shape(array)} {np.asarray(array).dtype}".encode())
             digest.update(np.ascontiguousarray(array))
         key = digest.digest()
-        skin = _baked.pop(key, None) or cls(asset, body, rest_positions, skin_joints, skin_weights)
+        skin = _baked.pop(key, None) or cls(asset, body, rest_positions, skin_joints, skin_weights, correctives)
         _baked[key] = skin
         while len(_baked) > _MOST_BAKED:
             _baked.popitem(last=False)
@@ -133,7 +145,15 @@ class Skin:
             raise ValueError(f"particle_positions has shape {particle_positions.shape}, not ({self.num_particles}, 3)")
         transforms = self._transforms(rotations, positions)
         displacement = particle_positions - self._particle_skinning @ transforms
-        return (self._vertex_skinning @ transforms + self._interpolation @ displacement).astype(np.float32)
+        vertices = self._vertex_skinning @ transforms
+        if self._pose is not None:
+            rotations = np.asarray(rotations, dtype=np.float64)
+            vertices += _turned(self._vertex_weights, rotations, self._pose.displacement(rotations))
+            if self._correctives is not None:
+                local = np.concatenate([rotations[:1], rotations[list(PARENTS[1:])].transpose(0, 2, 1) @ rotations[1:]])
+                own = self._correctives.displacement(Rotation.from_matrix(local).as_quat())
+                displacement -= _turned(self._particle_weights, rotations, own)
+        return (vertices + self._interpolation @ displacement).astype(np.float32)
 
     def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
         """Interpolate a quantity of the particles on the skin, shape ``(P, ...)`` to ``(V, ...)``."""
@@ -161,6 +181,11 @@ def _skinning_matrix(points: np.ndarray, joints: np.ndarray, weights: np.ndarray
     matrix = sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(len(points), 4 * NUM_JOINTS))
     matrix.eliminate_zeros()
     return matrix
+
+
+def _turned(weights: sparse.csr_array, rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return vectors of points ``(N, 3)`` turned as their skinning turns them."""
+    return np.einsum("nij,nj->ni", (weights @ rotations.reshape(NUM_JOINTS, 9)).reshape(-1, 3, 3), vectors)
 
 
 def _joint_weights(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -7,6 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body import skeleton
+from piavatar_envs.avatar.body.asset import Look, PoseDisplacements
+from piavatar_envs.avatar.body.pose_correctives import PoseCorrectives
 from piavatar_envs.render import Skin
 
 REST = np.tile(np.eye(3), (22, 1, 1))
@@ -53,6 +55,35 @@ def test_particles_at_their_skinned_places_leave_plain_skinning(subject, bent_po
     )
     assert np.abs(expected - subject.body.vertices).max() > 0.3
     np.testing.assert_allclose(subject.skin.deform(rotations, positions, skinned), expected, atol=1e-5)
+
+
+def test_displacements_by_the_pose_stand_in_place_of_those_of_the_particles(subject, bent_pose):
+    """A knee has both, in the mesh and in the particles: the drawn bulge is the mesh's, once."""
+    joints, points, knee = subject.body.joints, subject.particles, skeleton.joint_index("left_knee")
+    rng = np.random.default_rng(0)
+    directions = np.zeros((len(subject.body.vertices), 3, 21, 9), np.float32)
+    directions[:, :, knee - 1] = rng.normal(0.0, 0.02, (len(directions), 3, 9))
+    turn = Rotation.from_rotvec([0.3, 0.2, -0.4]).as_matrix()
+    pose = PoseDisplacements(directions, np.tile(turn, (22, 1, 1)))
+    look = Look(subject.body.vertices, subject.asset.faces, subject.asset.skin_joints, subject.asset.skin_weights, None,
+                subject.asset.shape_deltas, pose)  # fmt: skip
+    count = len(points)
+    linear = rng.normal(0.0, 0.02, (count, 3, 3))
+    correctives = PoseCorrectives(np.arange(count + 1), np.full(count, knee), linear, np.zeros((count, 3, 3)))
+    own = Skin(look, subject.body, subject.positions, points.skin_joints, points.skin_weights, correctives)
+    rotations, positions = skeleton.forward_kinematics(bent_pose, joints[0], joints)
+    quaternions = Rotation.from_matrix(bent_pose).as_quat()
+    moved = subject.positions + correctives.displacement(quaternions)
+    skinned = skeleton.skin(moved, points.skin_joints, points.skin_weights, rotations, positions, joints)
+    # the mesh counts rotations from a pose that all bones are turned from: turn^T R turn of each joint
+    change = turn.T @ bent_pose[knee] @ turn - np.eye(3)
+    bulge = directions[:, :, knee - 1] @ change.ravel()
+    assert np.linalg.norm(bulge, axis=1).max() > 0.02
+    expected = skeleton.skin(
+        subject.body.vertices + bulge, look.skin_joints, look.skin_weights, rotations, positions, joints
+    )
+    np.testing.assert_allclose(own.deform(rotations, positions, skinned), expected, atol=1e-5)
+    np.testing.assert_allclose(own.deform(REST, joints, subject.positions), subject.body.vertices, atol=1e-6)
 
 
 def test_a_uniform_displacement_moves_the_skin_by_it(subject, bent_pose):

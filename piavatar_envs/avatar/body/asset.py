@@ -27,6 +27,35 @@ class ShapedBody:
 
 
 @dataclass(frozen=True, eq=False)
+class PoseDisplacements:
+    """Displacements of vertices in the reference pose, linear in the matrices of the joints' local rotations.
+
+    The file that they come from counts rotations from a pose of its own, in which all of its bones have the identity.
+
+    Attributes:
+        directions: displacement by each element of the matrix of each joint but the root [m], shape
+            ``(V, 3, 21, 9)`` float32.
+        reference: world rotations of the bones from the file's pose to the reference pose, shape ``(22, 3, 3)``.
+    """
+
+    directions: np.ndarray
+    reference: np.ndarray
+
+    def displacement(self, rotations: np.ndarray) -> np.ndarray:
+        """Return the displacements [m], shape ``(V, 3)``; none in the reference pose.
+
+        Args:
+            rotations: world rotations of the bones, identity in the reference pose, shape ``(22, 3, 3)``.
+        """
+        parents = list(PARENTS[1:])
+        turned, still = rotations @ self.reference, self.reference
+        moved = turned[parents].transpose(0, 2, 1) @ turned[1:]
+        rest = still[parents].transpose(0, 2, 1) @ still[1:]
+        flat = self.directions.reshape(-1, 9 * len(parents))
+        return (flat @ (moved - rest).astype(np.float32).ravel()).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
 class Look:
     """A surface that is drawn in place of the skin, such as a clothed character; it has no part in the simulation.
 
@@ -37,6 +66,7 @@ class Look:
         skin_weights: their weights, descending, rows sum to one, shape ``(W, 4)`` float32.
         colors: sRGB of the vertices, shape ``(W, 3)`` uint8, or None for the one colour of the avatar.
         shape_deltas: displacements as those of the skin [m], shape ``(S, 2, W, 3)`` float32.
+        pose: displacements that depend on the pose, if the file has such.
     """
 
     vertices: np.ndarray
@@ -45,6 +75,7 @@ class Look:
     skin_weights: np.ndarray
     colors: np.ndarray | None
     shape_deltas: np.ndarray
+    pose: PoseDisplacements | None = None
 
 
 @dataclass(frozen=True, eq=False)

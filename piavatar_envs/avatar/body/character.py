@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, Look, top_weights
+from piavatar_envs.avatar.body.asset import AvatarAsset, Look, PoseDisplacements, top_weights
 from piavatar_envs.avatar.body.closed_skin import CELL, Soup, close_skin, read_soup
 from piavatar_envs.avatar.body.rigs import spread_weights
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
@@ -50,12 +50,14 @@ class Character:
         faces: triangles of all surfaces, shape ``(T, 3)`` int32.
         weights: of the joints, rows sum to one, shape ``(V, 22)`` float64.
         joints: joint positions [m], shape ``(22, 3)`` float64.
-        colors: sRGB of the vertices, shape ``(V, 3)`` uint8.
+        colors: sRGB of the vertices, shape ``(V, 3)`` uint8, or None for the one colour of the avatar.
         surfaces: parts of ``faces``, in order.
         shape_names: names of the ``S`` shape parameters.
         shape_deltas: vertex displacements at -1 and at +1 of each parameter [m], shape ``(S, 2, V, 3)``.
         shape_joints: joint displacements, the same way [m], shape ``(S, 2, 22, 3)``.
         notes: what was guessed in reading it, such as the unit.
+        pose: displacements of the vertices that depend on the pose, for the look; only of a character that rests in
+            the reference pose already.
     """
 
     name: str
@@ -63,12 +65,13 @@ class Character:
     faces: np.ndarray
     weights: np.ndarray
     joints: np.ndarray
-    colors: np.ndarray
+    colors: np.ndarray | None
     surfaces: tuple[Surface, ...]
     shape_names: tuple[str, ...]
     shape_deltas: np.ndarray
     shape_joints: np.ndarray
     notes: tuple[str, ...] = ()
+    pose: PoseDisplacements | None = None
 
     @property
     def held(self) -> np.ndarray:
@@ -122,7 +125,7 @@ def to_reference_pose(character: Character) -> Character:
     Raises:
         ValueError: a limb points opposite to that of the embedded body.
     """
-    rotations = _reference_rotations(character.joints)
+    rotations = reference_rotations(character.joints)
     matrix = _turn(character.joints, rotations)
     vertices = _blend(character.weights, matrix, character.vertices)
     joints = _moved_joints(character.joints, rotations)
@@ -142,7 +145,7 @@ def with_all_joints(character: Character) -> Character:
     return replace(character, weights=spread_weights(character.weights, character.vertices, character.joints))
 
 
-def _reference_rotations(joints: np.ndarray) -> np.ndarray:
+def reference_rotations(joints: np.ndarray) -> np.ndarray:
     """Return world rotations of the bones into the reference pose, shape ``(22, 3, 3)``."""
     from piavatar_envs.avatar.body.sources.embedded import build  # which is a source, as those that need this
 
@@ -187,8 +190,9 @@ def _look(posed: Character, soup: Soup) -> Look:
         faces=np.concatenate([faces, inner]).astype(np.int32),
         skin_joints=skin_joints,
         skin_weights=skin_weights,
-        colors=np.ascontiguousarray(posed.colors[chosen], np.uint8),
+        colors=None if posed.colors is None else np.ascontiguousarray(posed.colors[chosen], np.uint8),
         shape_deltas=np.asarray(posed.shape_deltas, np.float32).reshape(-1, 2, len(posed.vertices), 3)[:, :, chosen],
+        pose=None if posed.pose is None else PoseDisplacements(posed.pose.directions[chosen], posed.pose.reference),
     )
 
 
@@ -203,7 +207,7 @@ def _check(character: Character) -> None:
         ("vertices", character.vertices, (count, 3)),
         ("weights", character.weights, (count, NUM_JOINTS)),
         ("joints", character.joints, (NUM_JOINTS, 3)),
-        ("colors", character.colors, (count, 3)),
+        ("colors", np.zeros((count, 3)) if character.colors is None else character.colors, (count, 3)),
     )
     for name, array, shape in shapes:
         if np.shape(array) != shape:

@@ -79,8 +79,8 @@ def read_skeleton(path: str | Path, joints: np.ndarray, axes: np.ndarray | None 
     if distance > 2.0 * span or np.ptp(found.points, axis=0).max() < 0.1 * span:
         size = np.ptp(found.points, axis=0).max()
         raise ValueError(
-            f"{path} has a skeleton of {size:.3g} m whose points are up to {distance:.3g} m from the body, whose joints "
-            f"span {span:.3g} m; give it in metres, in the pose and place of the body's file"
+            f"{path} has a skeleton of {size:.3g} m, up to {distance:.3g} m from the body, whose joints span "
+            f"{span:.3g} m; give it in metres, in the pose and place of the body's file"
         )
     return thinned(found, STEP)
 

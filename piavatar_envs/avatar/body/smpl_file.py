@@ -95,14 +95,22 @@ class SmplModel:
 
     def skinned(self, vertices: np.ndarray, joints: np.ndarray, rotations: np.ndarray) -> np.ndarray:
         """Return vertices ``(V, 3)`` moved by linear blend skinning, without pose displacements."""
-        world, place = np.array(rotations, dtype=np.float64), np.array(joints, dtype=np.float64)
+        place, world = np.array(joints, dtype=np.float64), self._world(rotations)
         for joint in range(1, len(self.parents)):
             parent = self.parents[joint]
-            world[joint] = world[parent] @ world[joint]
             place[joint] = place[parent] + world[parent] @ (joints[joint] - joints[parent])
         offset = place - np.einsum("jab,jb->ja", world, joints)
-        blended = np.einsum("vj,jab->vab", self.weights, world)
-        return np.einsum("vab,vb->va", blended, vertices) + self.weights @ offset
+        return np.einsum("vab,vb->va", self.turns(rotations), vertices) + self.weights @ offset
+
+    def turns(self, rotations: np.ndarray) -> np.ndarray:
+        """Return the matrices by which skinning turns displacements of the vertices, shape ``(V, 3, 3)``."""
+        return (self.weights @ self._world(rotations).reshape(-1, 9)).reshape(-1, 3, 3)
+
+    def _world(self, rotations: np.ndarray) -> np.ndarray:
+        world = np.array(rotations, dtype=np.float64)
+        for joint in range(1, len(world)):
+            world[joint] = world[self.parents[joint]] @ world[joint]
+        return world
 
     def body_weights(self) -> np.ndarray:
         """Return the weights of the 22 joints of the body, ``(V, 22)``: hands, jaw and eyes move with their parents."""
