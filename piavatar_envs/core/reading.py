@@ -14,9 +14,9 @@ from pathlib import Path
 
 #: Errors of parsers (NumPy, zipfile, json, yaml, torch) on content that is damaged, foreign or too deeply nested.
 UNREADABLE: tuple[type[Exception], ...] = (
-    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError,
-    ValueError, lzma.LZMAError, pickle.UnpicklingError, struct.error, tokenize.TokenError, zipfile.BadZipFile,
-    zlib.error,
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, NameError, OSError, RuntimeError, SyntaxError,
+    TypeError, ValueError, lzma.LZMAError, pickle.UnpicklingError, struct.error, tokenize.TokenError,
+    zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 
 

@@ -23,7 +23,6 @@ SUFFIXES = (".ply", ".obj", ".stl", ".off")
 MAX_BYTES, MAX_PARTS = 2**29, 1000
 MAX_POINTS = 5_000_000
 STEP = 0.005  # between points of a surface [m]; larger triangles get points inside, smaller ones share one
-MAX_DIVISIONS = 64  # of a triangle's edges: 0.3 m
 #: Bones without a child end beyond their joint, by so much of the bone before.
 LEAF_LENGTH = 0.6
 #: Anatomical names of parts, the first that is found in a file's name counts; ``side`` stands for left or right.
@@ -58,31 +57,33 @@ def read_skeleton(path: str | Path, joints: np.ndarray, axes: np.ndarray | None 
 
     Raises:
         FileNotFoundError: there is no such file or folder.
-        ValueError: no mesh is found, one cannot be read, or is far from the body.
+        ValueError: no mesh is found, one cannot be read, or they are far from the body or of another size.
         MissingExtra: trimesh is not installed.
     """
     path = Path(path)
-    files = _files(path)
-    points, bones = [], []
-    for file in files:
-        own = _surface_points(file)
-        own = own if axes is None else own @ np.asarray(axes).T
-        nearest = nearest_bones(own, joints)
-        if path.is_dir():
-            named = bone_of_name(file.stem, own)
-            nearest = np.full(len(own), np.bincount(nearest).argmax() if named is None else joint_index(named))
-        points.append(own)
-        bones.append(nearest)
-    found = SkeletonPoints(np.concatenate(points), np.concatenate(bones).astype(np.int32))
+    axes = np.eye(3) if axes is None else np.asarray(axes)
     span = np.ptp(joints, axis=0).max()
-    distance = np.linalg.norm(found.points - joints.mean(axis=0), axis=1).max()
-    if distance > 2.0 * span or np.ptp(found.points, axis=0).max() < 0.1 * span:
-        size = np.ptp(found.points, axis=0).max()
+    parts = {}
+    for file in _files(path):
+        corners, loose = _surface(file)
+        parts[file] = corners @ axes.T, loose @ axes.T
+    ends = np.concatenate([part.reshape(-1, 3) for pair in parts.values() for part in pair])
+    distance, size = np.linalg.norm(ends - joints.mean(axis=0), axis=1).max(), np.ptp(ends, axis=0).max()
+    if distance > 2.0 * span or size < 0.1 * span:
         raise ValueError(
             f"{path} has a skeleton of {size:.3g} m, up to {distance:.3g} m from the body, whose joints span "
             f"{span:.3g} m; give it in metres, in the pose and place of the body's file"
         )
-    return thinned(found, STEP)
+    found = []
+    for file, part in parts.items():
+        points = _points(*part, path)
+        own = thinned(SkeletonPoints(points, np.zeros(len(points), np.int32)), STEP).points
+        name = bone_of_name(file.stem, own) if path.is_dir() else None
+        bone = nearest_bones(own, joints) if name is None else np.full(len(own), joint_index(name))
+        if path.is_dir():
+            bone = np.full(len(own), np.bincount(bone).argmax())
+        found.append(SkeletonPoints(own, bone.astype(np.int32)))
+    return thinned(SkeletonPoints(*(np.concatenate([getattr(f, a) for f in found]) for a in ("points", "bone"))), STEP)
 
 
 def bone_of_name(name: str, points: np.ndarray) -> str | None:
@@ -117,8 +118,9 @@ def nearest_bones(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
 def thinned(skeleton: SkeletonPoints, size: float) -> SkeletonPoints:
     """Return at most one point of a bone in each cube of edge ``size`` [m]: the nearest to the mean of those there."""
     cell = np.concatenate([skeleton.bone[:, None], np.floor(skeleton.points / size)], axis=1).astype(np.int64)
-    _, group, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    group = group.ravel()
+    cell -= cell.min(axis=0, initial=0)
+    key = np.ravel_multi_index(tuple(cell.T), cell.max(axis=0, initial=0) + 1)
+    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(group, column) for column in skeleton.points.T], axis=1) / count[:, None]
     off = np.linalg.norm(skeleton.points - mean[group], axis=1)
     order = np.lexsort((off, group))
@@ -146,8 +148,8 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
-def _surface_points(path: Path) -> np.ndarray:
-    """Return points of a mesh's surface, ``(N, 3)``: its vertices, and a lattice in triangles larger than a step."""
+def _surface(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return a mesh's triangles ``(T, 3, 3)`` and vertices ``(V, 3)``."""
     try:
         import trimesh
     except ImportError:
@@ -157,17 +159,21 @@ def _surface_points(path: Path) -> np.ndarray:
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(getattr(mesh, "faces", []))
         if len(vertices) == 0 or not np.isfinite(vertices).all():
             raise ValueError("it has no vertices, or some that are not finite")
-        if len(faces) == 0:
-            return vertices
-        corners = vertices[faces]
-    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    divisions = np.clip(np.ceil(edge / STEP), 1, MAX_DIVISIONS).astype(int)
-    total = int(((divisions + 1) * (divisions + 2) // 2).sum())
-    if total > MAX_POINTS:
-        raise ValueError(f"{path} needs {total} points every {STEP} m; at most {MAX_POINTS} are taken: simplify it")
-    points = [vertices]
-    for count in np.unique(divisions[divisions > 1]):
-        u, v = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
-        weights = np.stack([u, v, count - u - v], axis=-1)[u + v <= count] / count
-        points.append(np.einsum("kc,tci->tki", weights, corners[divisions == count]).reshape(-1, 3))
+        return vertices[faces.astype(np.int64)].reshape(-1, 3, 3), vertices
+
+
+def _points(triangles: np.ndarray, vertices: np.ndarray, path: Path) -> np.ndarray:
+    """Return points of a surface, ``(N, 3)``: its vertices, and more in triangles larger than a step."""
+    points, total = [vertices], len(vertices)
+    while len(triangles):  # halve longest edges
+        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+        long = edges.max(axis=1) > STEP
+        first = edges[long].argmax(axis=1)[:, None] + np.arange(3)
+        a, b, c = np.take_along_axis(triangles[long], first[..., None] % 3, axis=1).swapaxes(0, 1)
+        middle = 0.5 * (a + b)
+        total += len(middle)
+        if total > MAX_POINTS:
+            raise ValueError(f"{path} needs over {MAX_POINTS} points, one every {STEP} m; simplify it")
+        points.append(middle)
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
     return np.concatenate(points)
