@@ -1,4 +1,4 @@
-"""The command line: ``python -m piavatar_envs list | doctor | play | watch``.
+"""The command line: ``python -m piavatar_envs list | doctor | inspect | play | watch``.
 
 Each command imports its own modules, so that ``--help`` is quick.
 """
@@ -57,6 +57,32 @@ def doctor_command(
     if seconds is not None:
         report["compile"] = {"device": device, "seconds": round(seconds, 1)}
     doctor.show(report, as_json=json)
+
+
+def inspect_command(
+    file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help="a character or a motion")],
+    picture: Annotated[
+        Path | None, tyro.conf.arg(help="write a .png of the body and its skeleton (needs the extra render)")
+    ] = None,
+    json: Annotated[bool, tyro.conf.arg(help="print one JSON object, for scripts and bug reports")] = False,
+    config: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(aliases=["-c"], help="settings of the source, e.g. -c height=1.8 mapping=map.json"),
+    ] = (),
+) -> None:
+    """Show what a file of an avatar or a motion becomes: joints, size, mass, what is worn, and what was guessed.
+
+    Args:
+        file: to look at, e.g. knight.glb.
+        picture: file to write a picture to.
+        json: machine-readable output.
+        config: settings of the source that reads the file.
+    """
+    from piavatar_envs import doctor, inspection
+    from piavatar_envs.config import parse_assignments
+
+    doctor.quiet_warp()
+    inspection.show(inspection.examine(file, parse_assignments(config), picture), as_json=json)
 
 
 def play_command(
@@ -218,7 +244,13 @@ def main(args: list[str] | None = None) -> None:
 
         print(f"piavatar-envs {__version__}")
         return
-    commands = {"list": list_command, "doctor": doctor_command, "play": play_command, "watch": watch_command}
+    commands = {
+        "list": list_command,
+        "doctor": doctor_command,
+        "inspect": inspect_command,
+        "play": play_command,
+        "watch": watch_command,
+    }
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands,

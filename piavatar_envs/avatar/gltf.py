@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.motion.motion import slerp
 from piavatar_envs.core.reading import reading
 
 MAX_FILE = 2**31  # [bytes] of the file, and of a buffer beside it
@@ -106,7 +105,8 @@ class Track:
             )
         elif self.path == "rotation":
             start, end = values[first], values[last]
-            result = np.roll(slerp(np.roll(start, 1, axis=1), np.roll(end, 1, axis=1), share[:, 0]), -1, axis=1)
+            arcs = (Rotation.from_quat(start).inv() * Rotation.from_quat(end)).as_rotvec()  # the shorter ones
+            result = (Rotation.from_quat(start) * Rotation.from_rotvec(share * arcs)).as_quat()
         else:
             result = values[first] + share * (values[last] - values[first])
         if self.path == "rotation":
@@ -544,6 +544,17 @@ def numbers(values: Any, count: int, what: str) -> np.ndarray:
     return np.array(values, dtype=np.float64)
 
 
+def check_format(path: Path, content: bytes = b"") -> None:
+    """Refuse a file of another program by its ending or its first bytes, and name the converter.
+
+    Raises:
+        ValueError: it is such a file.
+    """
+    for magic, suffix, name, converter in _FOREIGN:
+        if content.startswith(magic) or path.suffix.lower() == suffix:
+            raise ValueError(f"it is {name}, which is not read; convert it to GLB by {converter}")
+
+
 def read_gltf(path: str | Path) -> Gltf:
     """Read a ``.gltf``, ``.glb`` or ``.vrm`` file; its arrays are read when they are asked of the result.
 
@@ -558,9 +569,7 @@ def read_gltf(path: str | Path) -> Gltf:
         if path.stat().st_size > MAX_FILE:
             raise ValueError(f"it has {path.stat().st_size} bytes, more than {MAX_FILE}")
         content = path.read_bytes()
-        for magic, suffix, name, converter in _FOREIGN:
-            if content.startswith(magic) or path.suffix.lower() == suffix:
-                raise ValueError(f"it is {name}, which is not read; convert it to GLB by {converter}")
+        check_format(path, content)
         document, binary = _chunks(content) if content[:4] == b"glTF" else (content, None)
         document = bytes(document)
         marks = sum(document.count(mark) for mark in (b"[", b"{", b","))

@@ -301,7 +301,7 @@ def volume_ratios(links: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.
     return np.clip(np.linalg.det(gradient), 0.1, 10.0)
 
 
-MOST_SPACING = 0.05  # lattice spacing over the height of the body
+MOST_SPACING = 0.06  # lattice spacing over the height of the body
 SPACING_PER_DX = 0.57  # lattice spacing over grid spacing: about 5 particles a cell
 SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own

@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
+from piavatar_envs.avatar.gltf import check_format
+from piavatar_envs.core.reading import reading
 
 #: Builds a body from the source's own settings.
 Builder = Callable[..., AvatarAsset]
@@ -75,6 +77,8 @@ def source_of(path: str | Path) -> str:
         for own in getattr(importlib.import_module(f"{__name__}.{name}"), "SUFFIXES", ()):
             known.setdefault(own, name)
     if suffix not in known:
+        with reading(path, "a character"):
+            check_format(Path(path))
         raise ValueError(f"no avatar source reads {path}; use a file of {', '.join(sorted(known))}")
     return known[suffix]
 

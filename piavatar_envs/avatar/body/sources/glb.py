@@ -7,7 +7,6 @@ things and never body; morph targets are left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -45,18 +44,16 @@ def build(path: str, height: float | None = None, mapping: str | None = None) ->
         FileNotFoundError: there is no such file.
         ValueError: it cannot be read, its rig lacks a joint, or its height is no person's.
     """
-    return body_of(read_character(path, height, None if mapping is None else read_mapping(mapping)))
+    return body_of(read_character(path, height, mapping))
 
 
-def read_character(
-    path: str | Path, height: float | None = None, mapping: Mapping[str, str] | None = None
-) -> Character:
+def read_character(path: str | Path, height: float | None = None, mapping: str | Path | None = None) -> Character:
     """Return the character of a file in its rest pose, in our axes and metres.
 
     Args:
         path: of the file.
         height: to scale it to [m].
-        mapping: from our joints to names of nodes.
+        mapping: of a mapping file.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -67,7 +64,7 @@ def read_character(
     if not any(piece.skin is not None for piece in surfaces.pieces):
         raise ValueError(f'{path} has no skinned mesh; for a surface without a skeleton use the source "mesh"')
     rest = surfaces.world[:, :3, 3]
-    joint_map = map_rig(gltf, rest, mapping)
+    joint_map = _rig(gltf, rest, mapping)
     owners = owner_of_nodes(joint_map, gltf.parents)
     kept = _kept(gltf, surfaces)
     notes = [*surfaces.notes, *joint_map.notes]
@@ -102,26 +99,20 @@ def read_character(
     )
 
 
-def map_rig(gltf: Gltf, rest: np.ndarray, mapping: Mapping[str, str] | None = None) -> JointMap:
-    """Return our joints among the nodes of a file; its meshes are no candidates, though they be named as joints.
+def joint_names(path: str | Path, mapping: str | Path | None = None) -> dict[str, str]:
+    """Return the names of the file's nodes that are our joints, by joint; those that it lacks are not in it.
 
     Args:
-        gltf: the file.
-        rest: positions of its nodes, shape ``(N, 3)``.
-        mapping: from our joints to names of nodes.
+        path: of the file.
+        mapping: of a mapping file.
 
     Raises:
-        ValueError: of the rig, with the path.
+        FileNotFoundError: there is no such file.
+        ValueError: it cannot be read, or its rig lacks a joint.
     """
-    joints = np.zeros(len(gltf.parents), bool)
-    for skin in gltf.skins:
-        joints[skin.joints] = True
-    meshes = np.array(["mesh" in node for node in gltf.items("nodes")], bool)
-    names = [name if own or not mesh else "" for name, own, mesh in zip(gltf.names, joints, meshes, strict=True)]
-    try:
-        return map_joints(names, gltf.parents, rest, gltf.humanoid, mapping)
-    except ValueError as error:
-        raise ValueError(f"{gltf.path}: {error}") from None
+    gltf = read_gltf(path)
+    rest = read_surfaces(gltf).world[:, :3, 3]
+    return {joint: gltf.names[node] for joint, node in _rig(gltf, rest, mapping).nodes.items()}
 
 
 def scale_of(size: float, height: float | None, path: str) -> tuple[float, list[str]]:
@@ -151,6 +142,29 @@ def scale_of(size: float, height: float | None, path: str) -> tuple[float, list[
         )
     unit = min(likely, key=lambda name: abs(np.log(likely[name] * size / 1.7)))
     return likely[unit], [f"it is {size:.4g} tall, which is taken for {unit}: {likely[unit] * size:.3f} m"]
+
+
+def _rig(gltf: Gltf, rest: np.ndarray, mapping: str | Path | None) -> JointMap:
+    """Return our joints among the nodes of a file; its meshes are no candidates, though they be named as joints.
+
+    Args:
+        gltf: the file.
+        rest: positions of its nodes, shape ``(N, 3)``.
+        mapping: of a mapping file.
+
+    Raises:
+        ValueError: of the rig, with the path.
+    """
+    by_hand = None if mapping is None else read_mapping(mapping)
+    joints = np.zeros(len(gltf.parents), bool)
+    for skin in gltf.skins:
+        joints[skin.joints] = True
+    meshes = np.array(["mesh" in node for node in gltf.items("nodes")], bool)
+    names = [name if own or not mesh else "" for name, own, mesh in zip(gltf.names, joints, meshes, strict=True)]
+    try:
+        return map_joints(names, gltf.parents, rest, gltf.humanoid, by_hand)
+    except ValueError as error:
+        raise ValueError(f"{gltf.path}: {error}") from None
 
 
 def _kept(gltf: Gltf, surfaces: Surfaces) -> list[int]:
