@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.cluster.vq import kmeans2, vq
 
 from piavatar_envs.render.scene import Body, Color
 
@@ -118,10 +120,10 @@ def oklab_to_srgb(lab: ArrayLike) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """The triangles of a body between two strains.
+    """The triangles of a body between two strains, or of about one colour.
 
     Attributes:
-        number: of the band, counted from the least strain.
+        number: of the band, counted from the least strain or darkest colour.
         vertices: theirs alone [m], shape ``(V, 3)``.
         faces: the triangles, shape ``(T, 3)``.
         color: sRGB in [0, 1], of the middle of the band.
@@ -134,18 +136,53 @@ class Band:
 
 
 def bands_of(body: Body) -> list[Band]:
-    """Split the body into bands of equal width in its scalars; bands without triangles are left out.
+    """Split a body into bands of equal width in its scalars, or of about one colour; empty ones are left out.
 
     A triangle belongs where the mean of its corners does; beyond the range, and NaN, to the last band.
     """
+    if body.scalars is None:
+        return [
+            Band(number, np.asarray(body.vertices)[used], faces, color)
+            for number, (used, faces, color) in enumerate(_split(body))
+        ]
     middles = (np.arange(NUM_BANDS) + 0.5) / NUM_BANDS
     colors = color_by(middles, 1.0)
     share = np.nan_to_num(np.asarray(body.scalars)[body.faces].mean(axis=1) / body.scalar_max, nan=1.0, posinf=1.0)
     band = np.clip(share * NUM_BANDS, 0.0, NUM_BANDS - 1.0).astype(np.int64)
     found = []
     for number in np.unique(band):
-        own = body.faces[band == number]
-        used, corners = np.unique(own, return_inverse=True)
-        faces = corners.reshape(-1, 3).astype(np.int32)
+        used, faces = _compact(body.faces[band == number])
         found.append(Band(int(number), np.asarray(body.vertices)[used], faces, tuple(colors[number])))
     return found
+
+
+#: Vertices, triangles and colour of every band of a surface.
+_Split = list[tuple[np.ndarray, np.ndarray, Color]]
+#: Splits by colours, of surfaces by the identity of their arrays, which are kept with them.
+_splits: OrderedDict[tuple[int, int], tuple[Body, _Split]] = OrderedDict()
+_MOST_SPLITS = 8
+
+
+def _split(body: Body) -> _Split:
+    """Split a surface by the colours of its triangles, into at most :data:`NUM_BANDS`; the same on every call."""
+    key = (id(body.colors), id(body.faces))
+    if key not in _splits:
+        triangles = np.asarray(body.colors, np.float64)[body.faces].mean(axis=1) / 255.0
+        palette = np.unique(np.rint(triangles * 255.0), axis=0) / 255.0
+        if len(palette) > NUM_BANDS:
+            chosen = triangles[np.linspace(0, len(triangles) - 1, 4096).astype(int)]
+            palette = np.unique(kmeans2(chosen, NUM_BANDS, minit="++", seed=0)[0], axis=0)
+        band = vq(triangles, palette)[0]
+        _splits[key] = (
+            body,
+            [(*_compact(body.faces[band == number]), tuple(palette[number].tolist())) for number in np.unique(band)],
+        )
+        while len(_splits) > _MOST_SPLITS:
+            _splits.popitem(last=False)
+    return _splits[key][1]
+
+
+def _compact(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices of some triangles, and the triangles among them alone."""
+    used, corners = np.unique(faces, return_inverse=True)
+    return used, corners.reshape(-1, 3).astype(np.int32)

@@ -219,7 +219,7 @@ def _meshes(scene: Scene) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, C
     """Yield name, vertices, triangles and colour of everything in a scene; names persist between scenes."""
     for index, body in enumerate(scene.bodies):
         name = f"{_WORLD}/body_{index}"
-        if body.scalars is None:
+        if body.scalars is None and body.colors is None:
             yield name, (body.vertices, body.faces, body.color)
             continue
         for band in bands_of(body):

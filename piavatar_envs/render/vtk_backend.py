@@ -79,9 +79,11 @@ class VtkBackend:
                 self._plotter.remove_actor("mesh", render=False)
             self._mesh = self._pyvista.PolyData.from_regular_faces(vertices.copy(), topology.faces)
             self._mesh.point_data["rgb"] = colors.copy()
+            # only fronts, as the software does: cloth has a second side of its own at the same place
             self._plotter.add_mesh(
-                self._mesh, scalars="rgb", rgb=True, lighting=False, name="mesh", reset_camera=False, render=False
-            )
+                self._mesh, scalars="rgb", rgb=True, lighting=False, culling="back", name="mesh", reset_camera=False,
+                render=False,
+            )  # fmt: skip
             self._topology = topology
             return
         self._mesh.points[:] = vertices

@@ -107,6 +107,68 @@ def test_shapes_of_one_source_are_drawn_under_its_own_names(device):
     env.close()
 
 
+def test_pictures_show_the_look_in_its_colours_unless_a_quantity_is_asked_for(device):
+    pytest.importorskip("pyvista")
+    asset = load_asset()
+    green = np.tile(np.array([[30, 200, 40]], np.uint8), (len(asset.vertices), 1))
+    looks = dataclasses.replace(asset, look=dataclasses.replace(asset.drawn, colors=green))
+    piavatar_envs.register_source("green", lambda: looks)
+    counts = []
+    for color in ("skin", "strain"):
+        env = make(REACH, device, render_mode="rgb_array", avatar={"source": "green"}, color=color)
+        env.reset(seed=0)
+        red, greens, blue = np.moveaxis(env.render().astype(int), -1, 0)
+        counts.append(int((greens - np.maximum(red, blue) > 25).sum()))
+        env.close()
+    assert counts[0] > 1000 and counts[1] < 0.05 * counts[0]
+
+
+def test_the_look_of_a_shape_stands_where_its_skin_does():
+    asset = load_asset()
+    raised = dataclasses.replace(asset.drawn, vertices=asset.vertices + np.float32(0.05))
+    dressed = dataclasses.replace(asset, look=raised)
+    parameters = asset.parameters(height=0.7, weight=-0.4)
+    shaped, drawn = dressed.shape(parameters), dressed.shape_drawn(parameters)
+    np.testing.assert_allclose(drawn.vertices, shaped.vertices + 0.05, atol=1e-5)
+    np.testing.assert_array_equal(drawn.joints, shaped.joints)
+
+
+def test_settings_below_avatar_go_to_the_source(device):
+    seen = []
+
+    def tuned(path=None, height=1.7, betas=(), name="x"):
+        seen.append((path, height, betas, name))
+        return load_asset()
+
+    piavatar_envs.register_source("tuned", tuned)
+    make(REACH, device, avatar={"source": "tuned", "height": 1.5, "betas": [0.1, -2]}).close()
+    assert seen[-1] == (None, 1.5, (0.1, -2), "x")
+    config = load_config(EnvConfig, None, {"avatar.source": "tuned", "avatar.name": "y"})
+    assert load_config(EnvConfig, config.model_dump(mode="json")) == config
+    with pytest.raises(
+        ConfigError, match=r"^avatar: .*'tuned' has no setting hight=2; it has path, height, betas, name"
+    ):
+        load_config(EnvConfig, None, {"avatar": {"source": "tuned", "hight": 2}})
+    with pytest.raises(ConfigError, match=r"^scene\.avatars\.1\.avatar: .*'embedded'.*height"):
+        load_config(EnvConfig, None, {"scene.avatars": [{}, {"avatar": {"height": 2.0}, "position": [1.0, 0.0]}]})
+    # an avatar that names a source has none of the environment's settings; one that does not changes some
+    own = {"scene.avatars": [{"avatar": {"source": "embedded"}}, {"avatar": {"height": 1.2}, "position": [1.0, 0.0]}]}
+    config = load_config(EnvConfig, config, own)
+    chosen = [config.avatar.of_avatar(avatar.avatar) for avatar in config.scene.avatars]
+    assert [one.settings for one in chosen] == [{}, {"name": "y", "height": 1.2}]
+    piavatar_envs.register_source("needy", lambda path: load_asset())
+    with pytest.raises(ConfigError, match="'needy' needs the setting path"):
+        load_config(EnvConfig, None, {"avatar.source": "needy"})
+
+
+def test_a_file_that_changed_is_read_again(tmp_path):
+    file = tmp_path / "factor.txt"
+    file.write_text("0.5")
+    before = load_asset("scaled", str(file))
+    file.write_text("0.75")
+    assert np.ptp(load_asset("scaled", str(file)).vertices) == pytest.approx(1.5 * np.ptp(before.vertices))
+
+
 def test_a_source_reads_the_file_that_it_is_given(tmp_path):
     file = tmp_path / "factor.txt"
     file.write_text("0.5")

@@ -111,6 +111,23 @@ def test_strain_is_shown_in_bands_that_are_the_body(view, body):
     assert names(view) == {"body_0"} and not view._scale.visible
 
 
+def test_a_look_is_shown_in_bands_of_its_colours(view, body):
+    colors = np.zeros((len(body.vertices), 3), np.uint8)
+    upper = np.asarray(body.vertices)[:, 2] > 1.0
+    colors[upper] = (255, 0, 0)
+    dressed = Body(body.vertices, body.faces, colors=colors)
+    bands = bands_of(dressed)
+    assert sum(len(band.faces) for band in bands) == len(body.faces)
+    assert {(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)} <= {tuple(np.round(band.color, 6)) for band in bands}
+    view.show(Scene([dressed], []), None)
+    before = {name: handle(view, name) for name in names(view)}
+    assert len(before) == len(bands)
+    view.show(Scene([Body(body.vertices + np.float32(0.1), body.faces, colors=colors)], []), 0.1)
+    assert {name: handle(view, name) for name in names(view)} == before
+    many = np.random.default_rng(0).integers(0, 256, colors.shape).astype(np.uint8)
+    assert 1 < len(bands_of(Body(body.vertices, body.faces, colors=many))) <= NUM_BANDS
+
+
 def test_strain_beyond_all_bounds_has_the_last_colour(body):
     broken = Body(body.vertices, body.faces, scalars=np.full(len(body.vertices), np.nan))
     assert [band.number for band in bands_of(broken)] == [NUM_BANDS - 1]

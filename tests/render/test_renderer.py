@@ -189,6 +189,32 @@ def test_strain_colors_and_their_scale(renderer, body, subject):
         renderer.render([Body(body.vertices, body.faces, scalars=np.zeros(3))])
 
 
+def test_a_body_is_drawn_in_the_colours_of_its_vertices(renderer, body):
+    plain = renderer.render([body])
+    colors = np.tile(np.rint(255.0 * np.array(GREEN)).astype(np.uint8), (len(body.vertices), 1))
+    dressed = Body(body.vertices, body.faces, colors=colors)
+    assert np.abs(renderer.render([dressed]).astype(int) - plain).max() <= 2
+    upper = np.asarray(body.vertices)[:, 2] > 1.0
+    half = Body(body.vertices, body.faces, colors=np.where(upper[:, None], colors, np.uint8(128)))
+    covered = bounds(green(renderer.render([half])))
+    assert covered[2] == bounds(green(plain))[2] and covered[3] < bounds(green(plain))[3] - 20
+    strained = Body(body.vertices, body.faces, colors=colors, scalars=np.zeros(len(colors)))
+    assert green(renderer.render([strained])).sum() == 0
+    with pytest.raises(ValueError, match="colors have shape"):
+        renderer.render([Body(body.vertices, body.faces, colors=colors[:3])])
+
+
+def test_only_fronts_are_drawn(renderer, body):
+    # Cloth has two sides at the same place: drawn from behind, either would flicker through the other.
+    eye = np.array(FIXED.position)
+    side, up, middle = np.cross(eye, [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.9])
+    side *= 0.3 / np.linalg.norm(side)
+    corners = np.stack([middle - side, middle + side, middle + side + 0.4 * up, middle - side + 0.4 * up])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    shown = [green(renderer.render([Body(corners, way, color=GREEN)])).sum() for way in (faces, faces[:, ::-1].copy())]
+    assert min(shown) == 0 and max(shown) > 100
+
+
 def test_a_body_that_blew_up_is_drawn(renderer, body):
     vertices = body.vertices.copy()
     vertices[::50] = np.nan
