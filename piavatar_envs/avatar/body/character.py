@@ -6,16 +6,20 @@ this package rests, closes its skin, and keeps its own surfaces as the look of t
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 
+from piavatar_envs.avatar.body import closed_skin, sampling
 from piavatar_envs.avatar.body.asset import AvatarAsset, Look, PoseDisplacements, top_weights
-from piavatar_envs.avatar.body.closed_skin import CELL, Soup, close_skin, read_soup
+from piavatar_envs.avatar.body.closed_skin import CELL, ClosedSkin, close_skin, read_soup
 from piavatar_envs.avatar.body.rigs import spread_weights
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs
+from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Standing heights that are taken for those of a person [m].
 HEIGHTS = (0.3, 3.0)
@@ -93,11 +97,9 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
         ValueError: its height is outside :data:`HEIGHTS`, nothing encloses a volume, or arrays do not fit together.
     """
     _check(character)
-    soup = read_soup(character.vertices, character.faces, character.held, cell)
     posed = to_reference_pose(with_all_joints(character))
-    skin = close_skin(soup, posed.vertices, cell)
-    weights = np.maximum(skin.anchors @ posed.weights, 0.0)
-    skin_joints, skin_weights = top_weights(weights)
+    skin, flipped, worn = _closed(character, posed.vertices, cell)
+    skin_joints, skin_weights = top_weights(np.maximum(skin.anchors @ posed.weights, 0.0))
     count = len(posed.shape_names)
     deltas = np.zeros((count, 2, len(skin.vertices), 3), np.float32)
     for parameter, half in np.ndindex(count, 2):
@@ -112,8 +114,30 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
         shape_names=posed.shape_names,
         shape_deltas=deltas,
         shape_joints=np.asarray(posed.shape_joints, np.float32).reshape(count, 2, NUM_JOINTS, 3),
-        look=_look(posed, soup),
+        look=_look(posed, flipped, worn),
     )
+
+
+def _closed(character: Character, posed: np.ndarray, cell: float) -> tuple[ClosedSkin, np.ndarray, np.ndarray]:
+    """Return the closed skin in the posed vertices, and the triangles to turn round and those that are worn."""
+
+    def compute() -> dict[str, np.ndarray]:
+        soup = read_soup(character.vertices, character.faces, character.held, cell)
+        skin = close_skin(soup, posed, cell)
+        worn = np.ones(len(character.faces), bool)
+        for shell in soup.body:
+            worn[shell.rows] = False
+        anchors = {name: getattr(skin.anchors, name) for name in ("data", "indices", "indptr")}
+        return {"vertices": skin.vertices, "faces": skin.faces, "flipped": soup.flipped, "worn": worn, **anchors}
+
+    digest = digest_of(
+        [character.vertices, character.faces, character.held, posed, cell],
+        [sys.modules[__name__], closed_skin, sampling],
+    )
+    found = kept("skin", digest, compute, f"closing the skin of {character.name}")
+    shape = (len(found["vertices"]), len(character.vertices))
+    anchors = sparse.csr_array((found["data"], found["indices"], found["indptr"]), shape=shape)
+    return ClosedSkin(found["vertices"], found["faces"], anchors), found["flipped"], found["worn"]
 
 
 def to_reference_pose(character: Character) -> Character:
@@ -175,13 +199,11 @@ def _blend(weights: np.ndarray, matrix: np.ndarray, points: np.ndarray) -> np.nd
     return np.einsum("vij,vj->vi", blended[:, :, :3], points) + blended[:, :, 3]
 
 
-def _look(posed: Character, soup: Soup) -> Look:
-    """Return the surfaces of a posed character; those that are open are drawn from both sides."""
+def _look(posed: Character, flipped: np.ndarray, worn: np.ndarray) -> Look:
+    """Return the surfaces of a posed character; those that are worn are drawn from both sides."""
     faces = np.array(posed.faces, np.int32)
-    faces[soup.flipped] = faces[soup.flipped, ::-1]
-    closed = [shell.rows for shell in soup.body]
-    open_rows = np.setdiff1d(np.arange(len(faces)), np.concatenate(closed) if closed else [])
-    used, inner = np.unique(faces[open_rows], return_inverse=True)
+    faces[flipped] = faces[flipped, ::-1]
+    used, inner = np.unique(faces[worn], return_inverse=True)
     inner = inner.reshape(-1, 3)[:, ::-1] + len(posed.vertices)
     chosen = np.concatenate([np.arange(len(posed.vertices)), used])
     skin_joints, skin_weights = top_weights(np.maximum(posed.weights, 0.0)[chosen])

@@ -23,8 +23,9 @@ in :mod:`piavatar_envs.mpm.measured_strain`. Only flesh that several bones move 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
@@ -32,10 +33,12 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body import interpolation, sampling, skeleton
 from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, turned_shares
 from piavatar_envs.avatar.body.interpolation import interpolation_matrix, rest_gradient
 from piavatar_envs.avatar.body.sampling import ParticleSet, sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import BEYOND, NUM_JOINTS
+from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Angle from which the coefficients are taken, to either side [rad].
 ANGLE = np.radians(40.0)
@@ -53,6 +56,10 @@ NEIGHBOURS = 8
 CELLS_PER_HEIGHT = 32
 #: Largest spacing of particles over the body's height that resolves how flesh makes way; coarser bodies get none.
 COARSEST = 0.03
+#: Arrays of an asset and of its particles on which the correctives depend.
+_GIVEN = (
+    "vertices", "faces", "joints", "skin_joints", "skin_weights", "spacing", "rest_positions", "bone", "links"
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +100,17 @@ def features(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache(maxsize=8)
 def pose_correctives(asset: AvatarAsset, particles: ParticleSet) -> PoseCorrectives:
     """Return the correctives of an asset's particles in its mean shape; other shapes use the same."""
+    of_both = [getattr(one, field.name) for one in (asset, particles) for field in fields(one) if field.name in _GIVEN]
+    digest = digest_of(of_both, [sys.modules[__name__], interpolation, sampling, skeleton])
+    doing = f"fitting how the flesh of {asset.name} makes way at bent joints"
+    correctives = PoseCorrectives(**kept("correctives", digest, lambda: vars(_fitted(asset, particles)), doing))
+    for field in fields(correctives):
+        getattr(correctives, field.name).setflags(write=False)
+    return correctives
+
+
+def _fitted(asset: AvatarAsset, particles: ParticleSet) -> PoseCorrectives:
+    """Fit the correctives, or interpolate those of other particles."""
     spacing = spacing_for(float(np.ptp(asset.vertices[:, 2])) / CELLS_PER_HEIGHT)
     if np.isclose(particles.spacing, spacing, rtol=0.01):
         return _listed(fit_correctives(particles, asset.joints.astype(float)))
@@ -191,7 +209,4 @@ def _listed(fitted: Iterable[np.ndarray]) -> PoseCorrectives:
     both = np.concatenate(found)[order].astype(np.float32)
     start = np.searchsorted(particle[order], np.arange(count + 1)).astype(np.int32)
     joint = np.concatenate(joints)[order].astype(np.int32)
-    correctives = PoseCorrectives(start, joint, both[..., :3].copy(), both[..., 3:].copy())
-    for array in (start, joint, correctives.linear, correctives.quadratic):
-        array.setflags(write=False)
-    return correctives
+    return PoseCorrectives(start, joint, both[..., :3].copy(), both[..., 3:].copy())

@@ -11,6 +11,7 @@ be neighbours in the body: then the threads of a warp access the same nodes of t
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,6 +21,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from piavatar_envs.avatar.body import skeleton_mesh
 from piavatar_envs.avatar.body.asset import (
     AvatarAsset,
     ShapedBody,
@@ -30,6 +32,7 @@ from piavatar_envs.avatar.body.asset import (
 )
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.skeleton_mesh import thinned
+from piavatar_envs.core.result_cache import digest_of, kept
 
 wp.set_module_options({"enable_backward": False})
 
@@ -379,6 +382,18 @@ def sample_particles(
         raise ValueError(f"spacing={spacing} m is outside (0, {coarsest:.3g}]; coarser would lose hands and feet")
     if bone_rings < 4:
         raise ValueError(f"bone_rings={bone_rings} gives under {MIN_BONE_PARTICLES} particles a bone; use 4 or more")
+    surface = (asset.vertices, asset.faces, asset.joints, asset.skin_joints, asset.skin_weights)
+    values = [*surface, asset.skeleton, spacing, seed, bone_rings, bone_voxel]
+    digest = digest_of(values, [sys.modules[__name__], skeleton_mesh])
+    doing = f"filling {asset.name} with particles {1e3 * spacing:.2g} mm apart"
+    arrays = kept("particles", digest, lambda: _sample(asset, spacing, seed, bone_rings, bone_voxel), doing)
+    for array in arrays.values():
+        array.setflags(write=False)
+    return ParticleSet(float(spacing), **arrays)
+
+
+def _sample(asset: AvatarAsset, spacing: float, seed: int, bone_rings: int, bone_voxel: float) -> dict[str, np.ndarray]:
+    """Return the arrays of :class:`ParticleSet` by name."""
     skin = ClosedSurface(asset.vertices, asset.faces)
     flesh, interior = _flesh_lattice(asset, skin, spacing, seed)
     bones, bone_of = _bone_particles(asset, skin, bone_rings, spacing, bone_voxel)
@@ -399,12 +414,18 @@ def sample_particles(
     depth = np.maximum(-distance, 0.0)
     order = order_of_body(positions, bone, skin_joints, skin_weights)
     links = np.argsort(order).astype(np.int32)[links]
-    first = (positions, volumes, skin_joints, skin_weights, bone)
-    rest = (anchors, coordinates, shell, depth)
-    arrays = (*(a[order] for a in first), links, *(a[order] for a in rest))
-    for array in arrays:
-        array.setflags(write=False)
-    return ParticleSet(float(spacing), *arrays)
+    of_particles = {
+        "rest_positions": positions,
+        "volumes": volumes,
+        "skin_joints": skin_joints,
+        "skin_weights": skin_weights,
+        "bone": bone,
+        "anchor_vertices": anchors,
+        "anchor_weights": coordinates,
+        "shell": shell,
+        "depth": depth,
+    }
+    return {"links": links, **{name: array[order] for name, array in of_particles.items()}}
 
 
 def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple[np.ndarray, np.ndarray]:
