@@ -24,12 +24,12 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, forward_kinematics, j
 _MIRRORED = ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 _SAGITTAL = ("spine1", "spine3", "neck", "head")
 #: Points of either surface that are compared, in search of a start and in the fit.
-_COARSE, _FINE = 500, 2500
+_COARSE, _FINE = 400, 1500
 #: Widths of the robust weights from the first step to the last, over the height.
 _WIDTHS = (0.10, 0.015)
-_COARSE_STEPS, _FINE_STEPS = 12, 40
+_COARSE_STEPS, _FINE_STEPS = 12, 30
 #: Starts that are fitted to the end, of those that were the closest after few steps.
-_FINALISTS = 3
+_FINALISTS = 2
 #: Pull of shape parameters and rotations to their rest, over the weight of a point at the final width.
 _SHAPE_PULL, _POSE_PULL = 0.02, 0.01
 #: Cosine between normals of points that may be a pair.
@@ -82,13 +82,15 @@ class Registered:
     """A fit, and what it says about the surface.
 
     Attributes:
-        fit: of the body.
+        turn: rotation vector of the body, which faces -y without one [rad], shape ``(3,)``.
+        shape: its shape parameters, shape ``(S,)``.
         joints: [m], shape ``(22, 3)``.
         weights: of the joints at every vertex of the surface, shape ``(V, 22)``.
         residual: mean distance between the surfaces, both ways, over the height.
     """
 
-    fit: Fit
+    turn: np.ndarray
+    shape: np.ndarray
     joints: np.ndarray
     weights: np.ndarray
     residual: float
@@ -153,6 +155,8 @@ class Cloud:
 def register(asset: AvatarAsset, vertices: np.ndarray, faces: np.ndarray, body: np.ndarray) -> Registered:
     """Fit the body to a surface that stands on its feet, in metres, z up; it may face any horizontal axis.
 
+    The same on every call.
+
     Args:
         asset: the embedded body.
         vertices: of the surface [m], shape ``(V, 3)``.
@@ -171,7 +175,7 @@ def register(asset: AvatarAsset, vertices: np.ndarray, faces: np.ndarray, body: 
     apart = _distance(points[:: len(points) // _FINE], vertices, faces[body])
     apart = 0.5 * (apart + _distance(cloud.points[::4], points, asset.faces))
     weights = _weights_at(asset, Cloud(points, normals), vertices, faces)
-    return Registered(fit, joints, weights, apart / float(np.ptp(vertices[:, 2])))
+    return Registered(fit.turn, fit.shape, joints, weights, apart / float(np.ptp(vertices[:, 2])))
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
