@@ -23,6 +23,8 @@ from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Standing heights that are taken for those of a person [m].
 HEIGHTS = (0.3, 3.0)
+#: Triangles of the body, those that are worn, and those without area or with the same corners as another one.
+_BODY, _WORN, _NONE = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
     """
     _check(character)
     posed = to_reference_pose(with_all_joints(character))
-    skin, flipped, worn = _closed(character, posed.vertices, cell)
+    skin, flipped, part = _closed(character, posed.vertices, cell)
     skin_joints, skin_weights = top_weights(np.maximum(skin.anchors @ posed.weights, 0.0))
     count = len(posed.shape_names)
     deltas = np.zeros((count, 2, len(skin.vertices), 3), np.float32)
@@ -114,21 +116,21 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
         shape_names=posed.shape_names,
         shape_deltas=deltas,
         shape_joints=np.asarray(posed.shape_joints, np.float32).reshape(count, 2, NUM_JOINTS, 3),
-        look=_look(posed, flipped, worn),
+        look=_look(posed, flipped, part),
     )
 
 
 def _closed(character: Character, posed: np.ndarray, cell: float) -> tuple[ClosedSkin, np.ndarray, np.ndarray]:
-    """Return the closed skin in the posed vertices, and the triangles to turn round and those that are worn."""
+    """Return the closed skin in the posed vertices, and of each triangle whether to turn it round, and what it is."""
 
     def compute() -> dict[str, np.ndarray]:
         soup = read_soup(character.vertices, character.faces, character.held, cell)
         skin = close_skin(soup, posed, cell)
-        worn = np.ones(len(character.faces), bool)
-        for shell in soup.body:
-            worn[shell.rows] = False
+        part = np.full(len(character.faces), _NONE, np.int8)
+        for shell in soup.shells:
+            part[shell.rows] = _BODY if shell.body else _WORN
         anchors = {name: getattr(skin.anchors, name) for name in ("data", "indices", "indptr")}
-        return {"vertices": skin.vertices, "faces": skin.faces, "flipped": soup.flipped, "worn": worn, **anchors}
+        return {"vertices": skin.vertices, "faces": skin.faces, "flipped": soup.flipped, "part": part, **anchors}
 
     digest = digest_of(
         [character.vertices, character.faces, character.held, posed, cell],
@@ -137,7 +139,7 @@ def _closed(character: Character, posed: np.ndarray, cell: float) -> tuple[Close
     found = kept("skin", digest, compute, f"closing the skin of {character.name}")
     shape = (len(found["vertices"]), len(character.vertices))
     anchors = sparse.csr_array((found["data"], found["indices"], found["indptr"]), shape=shape)
-    return ClosedSkin(found["vertices"], found["faces"], anchors), found["flipped"], found["worn"]
+    return ClosedSkin(found["vertices"], found["faces"], anchors), found["flipped"], found["part"]
 
 
 def to_reference_pose(character: Character) -> Character:
@@ -199,17 +201,17 @@ def _blend(weights: np.ndarray, matrix: np.ndarray, points: np.ndarray) -> np.nd
     return np.einsum("vij,vj->vi", blended[:, :, :3], points) + blended[:, :, 3]
 
 
-def _look(posed: Character, flipped: np.ndarray, worn: np.ndarray) -> Look:
+def _look(posed: Character, flipped: np.ndarray, part: np.ndarray) -> Look:
     """Return the surfaces of a posed character; those that are worn are drawn from both sides."""
     faces = np.array(posed.faces, np.int32)
     faces[flipped] = faces[flipped, ::-1]
-    used, inner = np.unique(faces[worn], return_inverse=True)
+    used, inner = np.unique(faces[part == _WORN], return_inverse=True)
     inner = inner.reshape(-1, 3)[:, ::-1] + len(posed.vertices)
     chosen = np.concatenate([np.arange(len(posed.vertices)), used])
     skin_joints, skin_weights = top_weights(np.maximum(posed.weights, 0.0)[chosen])
     return Look(
         vertices=posed.vertices[chosen].astype(np.float32),
-        faces=np.concatenate([faces, inner]).astype(np.int32),
+        faces=np.concatenate([faces[part != _NONE], inner]).astype(np.int32),
         skin_joints=skin_joints,
         skin_weights=skin_weights,
         colors=None if posed.colors is None else np.ascontiguousarray(posed.colors[chosen], np.uint8),

@@ -58,7 +58,8 @@ CELLS_PER_HEIGHT = 32
 COARSEST = 0.03
 #: Arrays of an asset and of its particles on which the correctives depend.
 _GIVEN = (
-    "vertices", "faces", "joints", "skin_joints", "skin_weights", "spacing", "rest_positions", "bone", "links"
+    "vertices", "faces", "joints", "skin_joints", "skin_weights", "skeleton", "spacing", "rest_positions", "bone",
+    "links",
 )  # fmt: skip
 
 
