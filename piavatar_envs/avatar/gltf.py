@@ -164,6 +164,7 @@ class Gltf:
         self.json = document
         self._binary = binary
         self._buffers: dict[int, bytes | memoryview] = {}
+        self._lists: dict[str, list[dict[str, Any]]] = {}
         self._check_extensions()
         nodes = self.items("nodes")
         if len(nodes) > MAX_NODES:
@@ -183,10 +184,12 @@ class Gltf:
         Raises:
             ValueError: it is something else.
         """
-        found = self.json.get(key, [])
-        if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-            raise ValueError(f"{key} is no list of objects")
-        return found
+        if key not in self._lists:
+            found = self.json.get(key, [])
+            if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+                raise ValueError(f"{key} is no list of objects")
+            self._lists[key] = found
+        return self._lists[key]
 
     def item(self, key: str, index: Any) -> dict[str, Any]:
         """Return one object of a list of the document.

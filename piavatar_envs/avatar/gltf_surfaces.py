@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from piavatar_envs.avatar.gltf import Gltf, numbers, whole
+from piavatar_envs.avatar.gltf import MAX_VALUES, Gltf, numbers, whole
 from piavatar_envs.core.extras import install_command
 from piavatar_envs.core.reading import UNREADABLE, reading
 
@@ -175,12 +175,11 @@ class _Reader:
     notes: list[str] = field(default_factory=list)
     _arrays: dict[int, np.ndarray] = field(default_factory=dict)
     _textures: dict[int, np.ndarray | None] = field(default_factory=dict)
-    _vertices: int = 0
-    _triangles: int = 0
 
     def pieces(self) -> list[Piece]:
         """Return the triangles of all nodes that are shown."""
-        pieces = []
+        found = []
+        vertices = triangles = 0
         for index, node in enumerate(self.gltf.items("nodes")):
             if "mesh" not in node or not self.gltf.shown[index]:
                 continue
@@ -188,10 +187,20 @@ class _Reader:
             name = self.gltf.names[index] or str(mesh.get("name", ""))
             for primitive in mesh.get("primitives", []):
                 if primitive.get("mode", 4) in (4, 5, 6) and "POSITION" in primitive.get("attributes", {}):
-                    pieces.append(self.piece(index, node, name, primitive))
+                    corners = self.count(primitive["attributes"]["POSITION"])
+                    vertices += corners
+                    triangles += (self.count(primitive["indices"]) if "indices" in primitive else corners) // 3
+                    found.append((index, node, name, primitive))
                 if primitive.get("targets"):
                     self.notes.append("morph targets are left out")
+                if vertices > MAX_VERTICES or triangles > MAX_TRIANGLES:
+                    raise ValueError(f"it has over {MAX_VERTICES} vertices or {MAX_TRIANGLES} triangles; {_SIMPLIFY}")
+        pieces = [self.piece(*primitive) for primitive in found]
         return [piece for piece in pieces if len(piece.faces)]
+
+    def count(self, index: Any) -> int:
+        """Return how many elements an accessor says that it has."""
+        return whole(self.gltf.item("accessors", index).get("count"), f"count of accessor {index}", MAX_VALUES, low=1)
 
     def array(self, index: Any, width: int, what: str) -> np.ndarray:
         """Return an accessor of some width, read once."""
@@ -208,10 +217,6 @@ class _Reader:
         what = f"mesh of node {index}"
         points = self.array(attributes["POSITION"], 3, f"POSITION of the {what}")
         faces = self.triangles(primitive, len(points), what)
-        self._vertices += len(points)
-        self._triangles += len(faces)
-        if self._vertices > MAX_VERTICES or self._triangles > MAX_TRIANGLES:
-            raise ValueError(f"it has more than {MAX_VERTICES} vertices or {MAX_TRIANGLES} triangles; {_SIMPLIFY}")
         used, inverse = np.unique(faces, return_inverse=True)
         faces = inverse.reshape(-1, 3)
         skin = None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+import tracemalloc
 
 import gymnasium as gym
 import numpy as np
@@ -179,15 +181,57 @@ def test_other_heights_are_refused(size):
         scale_of(1.75, 0.1, "a.glb")
 
 
-@pytest.mark.parametrize("task", ["PIAvatar/Reach-v0", "PIAvatar/KickBall-v0"])
-def test_a_character_plays(task, asset, tmp_path, device):
+def test_a_million_triangles_are_read_in_seconds(asset, tmp_path):
+    out = rig_of(asset, named("mixamo")).write()
+    side = 708
+    across, along = np.meshgrid(
+        np.linspace(0.0, 1.0, side, dtype=np.float32), np.linspace(0.0, 1.0, side), indexing="ij"
+    )
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    square = np.stack([corner, corner + side, corner + 1, corner + 1, corner + side, corner + side + 1], axis=1)
+    cape = {
+        "POSITION": out.accessor(np.stack([across, along, 0.0 * along], -1).reshape(-1, 3).astype("<f4"), "VEC3"),
+        "JOINTS_0": out.accessor(np.full((side * side, 4), 9, "<u1"), "VEC4"),
+        "WEIGHTS_0": out.accessor(np.full((side * side, 4), 0.25, "<f4"), "VEC4"),
+    }
+    indices = out.accessor(square.astype("<u4").ravel(), "SCALAR")
+    mesh = out.add("meshes", {"primitives": [{"attributes": cape, "indices": indices}]})
+    out.document["scenes"][0]["nodes"].append(out.add("nodes", {"name": "cape", "mesh": mesh, "skin": 0}))
+    path = out.save(tmp_path / "a.glb")
+    tracemalloc.start()
+    begin = time.process_time()
+    character = read_character(path)
+    seconds, (_, peak) = time.process_time() - begin, tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(character.faces) > 1_000_000 and seconds < 20.0 and peak < 1e9
+
+
+@pytest.fixture
+def knight(asset, tmp_path):
+    """Return the setting of a character in centimetres."""
     material = {"name": "skin", "pbrMetallicRoughness": {"baseColorFactor": [0.2, 0.5, 1.0, 1.0]}}
     path = rig_of(asset, named("mixamo"), unit=100.0, material=material).write().save(tmp_path / "knight.glb")
-    avatar = {"source": "glb", "path": str(path), "height": 1.75}
-    env = gym.make(task, avatar=avatar, fidelity="tiny", device=device)
+    return {"source": "glb", "path": str(path), "height": 1.75}
+
+
+@pytest.mark.parametrize("task", ["PIAvatar/Reach-v0", "PIAvatar/KickBall-v0"])
+def test_a_character_plays(task, knight, device):
+    env = gym.make(task, avatar=knight, fidelity="tiny", device=device)
     env.reset(seed=0)
     env.action_space.seed(0)
     for _ in range(3):
         observation, _, terminated, _, info = env.step(env.action_space.sample())
         assert np.isfinite(observation).all() and not terminated, info
     env.close()
+
+
+def test_characters_wrestle(knight, device):
+    pytest.importorskip("pettingzoo", reason="needs the extra multi")
+    from piavatar_envs.multi import sumo_v0
+
+    game = sumo_v0.parallel_env(avatar=knight, fidelity="tiny", device=device)
+    game.reset(seed=0)
+    for _ in range(3):
+        observations, *_ = game.step({agent: game.action_space(agent).sample() for agent in game.agents})
+        assert len(observations) == 2 and all(np.isfinite(values).all() for values in observations.values())
+    game.close()

@@ -203,10 +203,10 @@ def test_required_extensions_that_are_not_read_are_refused(extension, remedy, fi
 def test_foreign_and_damaged_files_are_refused_in_one_line(name, content, message, tmp_path):
     path = tmp_path / name
     path.write_bytes(content)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(ValueError, match=message) as caught:
         read_gltf(path)
-    assert time.perf_counter() - begin < 1.0 and "\n" not in str(caught.value) and str(path) in str(caught.value)
+    assert time.process_time() - begin < 1.0 and "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
 def chain(count: int) -> list[dict]:
@@ -229,7 +229,7 @@ def chain(count: int) -> list[dict]:
         ({"nodes": [{"mesh": -1}]}, "index of meshes"),
         ({"accessors": [{"componentType": 5126, "type": "VEC3", "count": 2**32 - 1}]}, "count"),
         ({"accessors": [{"componentType": 5126, "type": "VEC3", "count": -3, "bufferView": 0}]}, "count"),
-        ({"accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**7, "bufferView": 0}]}, "its buffer view"),
+        ({"accessors": [{"componentType": 5126, "type": "VEC3", "count": 10**6, "bufferView": 0}]}, "its buffer view"),
         ({"accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 9}]}, "bufferViews"),
         (
             {"accessors": [{"componentType": 5126, "type": "VEC3", "count": 3, "bufferView": 0, "byteOffset": 30}]},
@@ -254,10 +254,10 @@ def test_hostile_documents_are_refused_in_a_second(change, message, file):
     out.save(file)
     out.document["buffers"] = [{"byteLength": len(out.blob)}]
     file.write_bytes(glb(json.dumps(out.document | change).encode(), bytes(out.blob)))
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(ValueError, match=message) as caught:
         read_surfaces(read_gltf(file))
-    assert time.perf_counter() - begin < 1.0 and "\n" not in str(caught.value) and str(file) in str(caught.value)
+    assert time.process_time() - begin < 1.0 and "\n" not in str(caught.value) and str(file) in str(caught.value)
 
 
 def test_values_that_are_not_finite_are_refused(file):
@@ -277,7 +277,7 @@ def test_indices_and_instances_are_bounded(file):
     many = out.accessor(np.tile(np.arange(3, dtype=np.uint8), 100_000), "SCALAR")
     primitive["indices"] = many
     out.document["nodes"] *= 10_000  # 10,000 times 100,000 triangles
-    begin = time.perf_counter()
-    with pytest.raises(ValueError, match=r"more than \d+ vertices.*simplify"):
+    begin = time.process_time()
+    with pytest.raises(ValueError, match=r"over \d+ vertices.*simplify"):
         read_surfaces(read_gltf(out.save(file)))
-    assert time.perf_counter() - begin < 3.0
+    assert time.process_time() - begin < 1.0

@@ -159,6 +159,29 @@ def test_missing_joints_are_made_where_the_embedded_body_has_them(lacks, far, as
         assert spread[:, joint_index(joint)].sum() > 10.0
 
 
+def test_limbs_whose_bones_are_only_numbered(asset):
+    side = (
+        "{l}_shoulder_0",
+        "arm_joint_{l}_1",
+        "arm_joint_{l}_2",
+        "arm_joint_{l}_3",
+        *(f"leg_joint_{{l}}_{i}" for i in range(4)),
+    )
+    middle = ("torso_joint_1", "torso_joint_2", "torso_joint_3", "torso_joint_4", "neck_joint_1", "neck_joint_2")
+    by_joint = dict(zip(_MIDDLE, middle, strict=True))
+    for ours, letter in (("left", "l"), ("right", "r")):
+        by_joint |= {f"{ours}_{j}": n.format(l=letter) for j, n in zip(_SIDE, side, strict=True)}
+    found = rigs.map_joints([by_joint[joint] for joint in JOINT_NAMES], PARENTS, asset.joints)
+    assert [found.nodes[joint] for joint in JOINT_NAMES] == list(range(22))
+
+
+def test_a_copy_of_the_skeleton_moves_with_the_first(asset):
+    """Clothes may be bound to bones of their own, which have the same names."""
+    names, parents = named("mixamo") * 2, [*PARENTS, *(p + 22 if p >= 0 else -1 for p in PARENTS)]
+    found = rigs.map_joints(names, parents, np.tile(asset.joints, (2, 1)))
+    assert np.array_equal(rigs.owner_of_nodes(found, parents), np.tile(np.arange(22), 2))
+
+
 def test_the_mapping_by_hand_has_the_last_word(asset, tmp_path):
     names = [f"Bone.{index:03d}" for index in range(22)]
     with pytest.raises(

@@ -355,7 +355,19 @@ class _Rig:
                 found[f"{side}_{joint}"] = nodes[int(np.linalg.norm(self.rest[nodes] - middle, axis=1).argmin())]
                 if joint == "foot":
                     self.toes[side] = nodes
+        for joints, word in ((("hip", "knee", "ankle", "foot"), "leg"), (("shoulder", "elbow", "wrist"), "arm")):
+            links = self.links(self.found.get((side, word), []))
+            if len(links) >= 3 and not all(f"{side}_{joint}" in found for joint in joints[:3]):
+                found |= {f"{side}_{joint}": node for joint, node in zip(joints, links, strict=False)}
         return found
+
+    def links(self, nodes: Sequence[int]) -> list[int]:
+        """Return those of some nodes that hang on each other, the uppermost first: a leg whose bones are numbered."""
+        chain: list[int] = []
+        for node in sorted(nodes, key=self.depth):
+            if not chain or chain[-1] in _upwards(node, self.parents):
+                chain.append(node)
+        return chain
 
     def middle(self, limbs: Mapping[str, int]) -> dict[str, int]:
         """Return pelvis, neck and head as far as names and the hierarchy above the limbs give them."""

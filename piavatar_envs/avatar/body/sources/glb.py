@@ -7,6 +7,8 @@ things and never body; morph targets are left out.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +76,8 @@ def read_character(path: str | Path, height: float | None = None, mapping: str |
     places = np.concatenate([surfaces.places[index] for index in kept])
     weights = np.concatenate([_weights(surfaces, index, owners) for index in kept])
     skinned = np.concatenate([np.full(len(surfaces.places[i]), surfaces.pieces[i].skin is not None) for i in kept])
-    axes, mirrors = axes_of(joint_map, rest, _foot_tips(joint_map, rest, places, weights))
+    with _of_file(path):
+        axes, mirrors = axes_of(joint_map, rest, _foot_tips(joint_map, rest, places, weights))
     notes += _axis_notes(axes, mirrors)
     places, rest = places @ axes.T, rest @ axes.T
     scale, unit = scale_of(float(np.ptp(places[skinned, 2])), height, str(path))
@@ -161,10 +164,17 @@ def _rig(gltf: Gltf, rest: np.ndarray, mapping: str | Path | None) -> JointMap:
         joints[skin.joints] = True
     meshes = np.array(["mesh" in node for node in gltf.items("nodes")], bool)
     names = [name if own or not mesh else "" for name, own, mesh in zip(gltf.names, joints, meshes, strict=True)]
-    try:
+    with _of_file(gltf.path):
         return map_joints(names, gltf.parents, rest, gltf.humanoid, by_hand)
+
+
+@contextmanager
+def _of_file(path: str | Path) -> Iterator[None]:
+    """Name the file in errors of its rig."""
+    try:
+        yield
     except ValueError as error:
-        raise ValueError(f"{gltf.path}: {error}") from None
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _kept(gltf: Gltf, surfaces: Surfaces) -> list[int]:
