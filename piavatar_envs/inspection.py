@@ -200,7 +200,7 @@ def _surfaces(character: Character) -> Report:
 
 
 def _motion(motion: str, settings: Mapping[str, Any]) -> str:
-    """Return length, rate and fastest joint of a motion, and what it was warned of."""
+    """Return length, rate and fastest joint of a motion, what was found in it and what it was warned of."""
     unknown = [name for name in settings if name != "mapping"]
     if unknown:
         raise ValueError(f"a motion has no setting {unknown[0]}={settings[unknown[0]]!r}; it has mapping")
@@ -211,8 +211,8 @@ def _motion(motion: str, settings: Mapping[str, Any]) -> str:
     speeds = clip.joint_speeds()
     joint = JOINT_NAMES[int(speeds.max(axis=0).argmax())]
     length = (clip.num_frames - 1) / clip.fps
-    warned = "".join(f"; {warning.message}" for warning in caught)
+    said = "".join(f"; {line}" for line in (*clip.notes, *(str(warning.message) for warning in caught)))
     return (
         f"{clip.name}: {length:.2f} s, {clip.num_frames} frames at {clip.fps:.4g}/s, fastest joint {joint} at "
-        f"{speeds.max():.3g} rad/s{warned}"
+        f"{speeds.max():.3g} rad/s{said}"
     )

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, forward_kinematics
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.retarget import align_limbs
+from tests.avatar.gltf_files import Writer
 
 SIDES = ("left", "right")
 ARMS_OUT = {
@@ -137,3 +138,63 @@ def write_bvh(
     lines += [" ".join(f"{value:.9f}" for value in row) for row in rows]
     path.write_bytes(newline.join([*lines, ""]).encode())
     return path
+
+
+def write_glb(
+    path: Path,
+    clips: dict[str, Motion],
+    rest: np.ndarray,
+    skeleton: Skeleton,
+    mode: str = "LINEAR",
+    shown: int | None = None,
+    armature: Rotation | None = None,
+) -> Path:
+    """Write a GLB file with an animation for each clip, and a skin; the file shows frame ``shown``, or the zero pose.
+
+    The nodes hang on an armature that is turned and scales them by ten.
+    """
+    out = Writer()
+    turn = Rotation.identity() if armature is None else armature
+    named = {name: skeleton.pose(motion, rest) for name, motion in clips.items()}
+    offsets, first_local, still = next(iter(named.values()))
+    first = next(iter(clips.values()))
+    offsets, hips = offsets / 10.0, skeleton.axes.apply(rest[0]) / skeleton.unit / 10.0
+    if shown is not None:
+        hips = skeleton.root(first)[shown] / 10.0
+    hips = turn.inv().apply(hips)
+    out.add("nodes", {"name": "Armature", "rotation": turn.as_quat().tolist(), "scale": [10.0] * 3, "children": [1]})
+    for j in range(NUM_JOINTS):
+        pose = still[j] if shown is None else first_local[j][shown]
+        pose = turn.inv() * pose if j == 0 else pose
+        node = {"name": skeleton.name(JOINT_NAMES[j]), "rotation": pose.as_quat().tolist()}
+        node["translation"] = (hips if j == 0 else offsets[j]).tolist()
+        node["children"] = [1 + child for child in range(NUM_JOINTS) if PARENTS[child] == j]
+        out.add("nodes", {key: value for key, value in node.items() if value != []})
+    world, places = [still[0]], [skeleton.axes.apply(rest[0]) / skeleton.unit]
+    for j in range(1, NUM_JOINTS):
+        places.append(places[PARENTS[j]] + world[PARENTS[j]].apply(10.0 * offsets[j]))
+        world.append(world[PARENTS[j]] * still[j])
+    binds = np.tile(np.eye(4), (NUM_JOINTS, 1, 1))
+    binds[:, :3, :3] = [10.0 * turn.as_matrix() for turn in world]
+    binds[:, :3, 3] = places
+    inverse = np.linalg.inv(binds).transpose(0, 2, 1).reshape(-1, 16).astype(np.float32)
+    joints = [1 + j for j in range(NUM_JOINTS)]
+    out.add("skins", {"joints": joints, "inverseBindMatrices": out.accessor(inverse, "MAT4")})
+    for name, motion in clips.items():
+        _, local, _ = named[name]
+        animation: dict = {"name": name, "channels": [], "samplers": []}
+        times = (np.arange(motion.num_frames) / motion.fps + 0.5).astype(np.float32)
+        clock = out.accessor(times[:, None], "SCALAR", min=[float(times[0])], max=[float(times[-1])])
+        local = [turn.inv() * local[0], *local[1:]]
+        tracks = [("rotation", 1 + j, local[j].as_quat(), "VEC4") for j in range(NUM_JOINTS)]
+        tracks.append(("translation", 1, turn.inv().apply(skeleton.root(motion)) / 10.0, "VEC3"))
+        for target, node, values, kind in tracks:
+            values = np.array(values, np.float32)
+            if mode == "CUBICSPLINE":
+                values = np.stack([0 * values, values, 0 * values], axis=1).reshape(-1, values.shape[1])
+            sampler = {"input": clock, "output": out.accessor(values, kind), "interpolation": mode}
+            animation["samplers"].append(sampler)
+            channel = {"sampler": len(animation["samplers"]) - 1, "target": {"node": node, "path": target}}
+            animation["channels"].append(channel)
+        out.add("animations", animation)
+    return out.save(path)

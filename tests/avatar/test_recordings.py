@@ -12,8 +12,10 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_in
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, load_motion
 from piavatar_envs.avatar.motion.bvh import read_bvh
+from piavatar_envs.avatar.motion.gltf_animations import read_animation
+from piavatar_envs.avatar.motion.library import clips_of
 from piavatar_envs.avatar.motion.recording import to_motion
-from tests.avatar.skeletons import X_UP, Y_UP, Y_UP_BACK, Z_UP, Skeleton, mixamo, unreal, write_bvh
+from tests.avatar.skeletons import X_UP, Y_UP, Y_UP_BACK, Z_UP, Skeleton, mixamo, unreal, write_bvh, write_glb
 
 REST = load_asset().joints.astype(np.float64)
 
@@ -227,3 +229,50 @@ def test_clips_that_nearly_meet_themselves_are_closed_when_asked(tmp_path: Path,
             scalar_first=True
         )
         assert Motion("swing", 30.0, swing, np.zeros((31, 3))).meets_itself() == meets
+
+
+# glTF animations
+
+
+@pytest.mark.parametrize(
+    ("skeleton", "how"),
+    [
+        (Skeleton(mixamo, 0.01, Y_UP), {}),
+        (Skeleton(unreal, 1.0, Y_UP_BACK, frames=Rotation.random(NUM_JOINTS, random_state=2)), {"mode": "CUBICSPLINE"}),
+        (Skeleton(mixamo, 1.0, Y_UP), {"shown": 30}),
+        (Skeleton(unreal, 0.01, Y_UP), {"armature": Rotation.from_euler("x", -90, degrees=True), "shown": 0}),
+    ],
+    ids=["centimetres", "own_axes", "shown_in_motion", "armature"],
+)
+def test_animations_come_back(tmp_path: Path, squat: Motion, kick: Motion, skeleton, how: dict) -> None:
+    path = write_glb(tmp_path / "hero.glb", {"Squat down": squat, "Kick.001": kick}, REST, skeleton, **how)
+    assert clips_of(path) == ["#Squat down", "#Kick.001"]
+    for name, motion in (("Squat down", squat), ("Kick.001", kick)):
+        read = to_motion(read_animation(path, name), REST)
+        distance, angle = differences(read, motion)
+        assert distance < 1e-3 and angle < 1e-3 and read.fps == motion.fps
+    assert differences(load_motion(f"{path}#Kick.001"), kick)[0] < 0.03
+    with pytest.raises(ValueError, match=r"the animations Squat down, Kick\.001; name one of them: hero\.glb#Sq"):
+        load_motion(path)
+    with pytest.raises(ValueError, match="no animation 'Run'"):
+        load_motion(f"{path}#Run")
+
+
+def test_files_without_a_motion_of_a_body_are_refused(tmp_path: Path, squat: Motion) -> None:
+    path = write_glb(tmp_path / "hero.glb", {"a": squat}, REST, Skeleton())
+    content = path.read_bytes()
+    assert load_motion(path).num_frames == squat.num_frames  # the only one needs no name
+    for old, new, message in (
+        (b'"animations"', b'"aminations"', "no animation"),
+        (b"glTF", b"gltf", "not a glTF file"),
+        (b'"path": "rotation"', b'"path": "rotatiom"', None),  # of no use, and passed over
+        (content[-4000:], b"", "not a glTF file"),
+    ):
+        (tmp_path / "bad.glb").write_bytes(content.replace(old, new))
+        if message is None:
+            still = load_motion(tmp_path / "bad.glb")
+            assert still.joint_speeds()[:, 1:].max() < 1e-6
+            continue
+        with pytest.raises(ValueError, match=message) as error:
+            load_motion(tmp_path / "bad.glb")
+        assert "\n" not in str(error.value)

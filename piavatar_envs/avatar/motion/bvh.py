@@ -17,13 +17,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.motion.recording import Recording
+from piavatar_envs.avatar.motion.recording import Recording, whole_rate
 from piavatar_envs.core.reading import reading
 
 MAX_BYTES = 2**28  # of a file: an hour of capture at 120 frames a second has half of it
 MAX_JOINTS = 2000
 LEAST_SHARE = 0.5  # of the frames that a header announces; a file with fewer was cut off
-RATE_DIGITS = 5e-4  # relative; a frame time is written with few digits, and rates are whole numbers
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 _FRAMES = re.compile(r"\s*Frames\s*:\s*(\S+)\s+Frame\s+Time\s*:\s*(\S+)", re.IGNORECASE)
 
@@ -141,8 +140,7 @@ def _frames(path: Path, body: str, joints: list[_Joint]) -> tuple[float, np.ndar
     if not np.isfinite(frames).all():
         frame, channel = np.argwhere(~np.isfinite(frames))[0]
         raise ValueError(f"{channels[channel]} is {frames[frame, channel]} in frame {frame}")
-    rate = 1.0 / frame_time
-    return (float(round(rate)) if abs(round(rate) - rate) < RATE_DIGITS * rate else rate), frames
+    return whole_rate(1.0 / frame_time), frames
 
 
 def _forward_kinematics(joints: list[_Joint], frames: np.ndarray) -> tuple[list[Rotation], np.ndarray]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -31,8 +32,10 @@ RATES = 5.0, 1000.0  # [1/s] of motion capture
 ROOT_SPEED = 20.0  # [m/s] of a pelvis, beyond sprinters and falls
 JOINT_SPEED = 25.0  # [rad/s] of a joint, about that of a punch
 GROUND_WINDOW = 0.8  # [s] longer than most flights; other skeletons stand otherwise than ours, so contact drifts
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
 #: Endings of files that may be motions.
-SUFFIXES = (".bvh", ".glb", ".gltf", ".npz", ".txt", ".vrm")
+SUFFIXES = (".bvh", ".npz", ".txt", *GLTF_SUFFIXES)
+_ANIMATION = re.compile(r"(.+?\.(?:glb|gltf|vrm))#(.+)", re.IGNORECASE)
 FILES = "an AMASS .npz, a .bvh, a .glb, .gltf or .vrm with animations, or a DeepMimic .txt file"
 
 
@@ -119,16 +122,33 @@ def load_motion(
 
 def clips_of(path: Path) -> list[str]:
     """Return what is added to the path of a file to name each of its clips: nothing where it has one, or has none."""
-    return [""]
+    if path.suffix.lower() not in GLTF_SUFFIXES:
+        return [""]
+    # the reader of characters imports this package
+    from piavatar_envs.avatar.motion.gltf_animations import names_of_animations
+
+    try:
+        names = names_of_animations(path)
+    except ValueError:
+        return [""]  # refused when it is loaded
+    return [f"#{name}" for name in names] if len(names) > 1 else [""]
 
 
 def _load_file(path: Path, joints: np.ndarray, mapping: Mapping[str, str] | None) -> tuple[Motion, float | None]:
     """Return the motion of a file by its suffix, and the window of its ground level [s]."""
-    suffix = path.suffix.lower()
+    file, clip = path, None
+    found = _ANIMATION.fullmatch(str(path))
+    if found and not path.is_file():
+        file, clip = Path(found[1]), found[2]
+    suffix = file.suffix.lower()
     if suffix == ".txt":
         motion = deepmimic.load_file(path, joints)
     elif suffix == ".bvh":
         motion = to_motion(read_bvh(path), joints, mapping)
+    elif suffix in GLTF_SUFFIXES:
+        from piavatar_envs.avatar.motion.gltf_animations import read_animation  # which imports this package
+
+        motion = to_motion(read_animation(file, clip, mapping), joints)
     elif suffix not in SUFFIXES and path.exists():
         kind = "a folder, of which TrackMotion draws motions" if path.is_dir() else "no motion by its suffix"
         raise ValueError(f"{path} is {kind}; give the path of {FILES}")

@@ -24,8 +24,7 @@ SEAM_ANGLE = 1e-3  # [rad] largest joint rotation left between the end and the s
 SEAM_HEIGHT = 1e-3  # [m] largest root height left between the end and the start of a loop
 NEAR_ANGLE = 0.35  # [rad] of a joint between the end and the start of a clip that can be closed
 NEAR_HEIGHT = 0.05  # [m] of its root
-NEAR_SPEED = 4.0  # [rad/s] by which a joint turns otherwise at the end
-_ENDS = 0, 1, -2, -1
+NEAR_SPEED = 4.0  # [rad/s] by which a joint turns otherwise at the start
 _MIRROR = np.array([1.0, 1.0, -1.0, -1.0])  # a wxyz rotation seen in a mirror normal to x
 _SWAPPED = [
     JOINT_NAMES.index(
@@ -192,14 +191,16 @@ class Motion:
     def meets_itself(self) -> bool:
         """Return whether the end nearly meets the start, up to a turn about the vertical and a step on the ground.
 
-        Poses, and how fast joints turn there, must agree within what a blend hides (:data:`NEAR_ANGLE`,
-        :data:`NEAR_HEIGHT`, :data:`NEAR_SPEED`).
+        Poses must agree within what a blend hides (:data:`NEAR_ANGLE`, :data:`NEAR_HEIGHT`), and joints change their
+        speeds there by at most :data:`NEAR_SPEED`, or twice as much as between any frames of the clip.
         """
         angles, height = self._gap()
-        ends = [Rotation.from_quat(self.local_rotations[frame].reshape(-1, 4), scalar_first=True) for frame in _ENDS]
-        first, last = (self.fps * (ends[i].inv() * ends[i + 1]).as_rotvec() for i in (0, 2))
-        speed = np.linalg.norm(first - last, axis=1).max()
-        return bool(angles.max() < NEAR_ANGLE and height < NEAR_HEIGHT and speed < NEAR_SPEED)
+        parts = (self.local_rotations[:-1].reshape(-1, 4), self.local_rotations[1:].reshape(-1, 4))
+        first, second = (Rotation.from_quat(part, scalar_first=True) for part in parts)
+        speeds = self.fps * (first.inv() * second).as_rotvec().reshape(-1, NUM_JOINTS, 3)
+        changes = np.linalg.norm(np.diff(speeds, axis=0), axis=-1).max(initial=0.0)
+        change = np.linalg.norm(speeds[-1] - speeds[0], axis=-1).max()
+        return bool(angles.max() < NEAR_ANGLE and height < NEAR_HEIGHT and change < max(NEAR_SPEED, 2.0 * changes))
 
     def mirrored(self) -> Motion:
         """Return the clip seen in a mirror: left and right change places, world x changes sign."""

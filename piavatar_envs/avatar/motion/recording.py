@@ -29,14 +29,21 @@ from piavatar_envs.avatar.motion.retarget import (
 
 #: Metres in a unit of length.
 UNITS: dict[str, float] = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}
+RATE_DIGITS = 5e-4  # relative
 LEGS = 0.55, 1.1  # [m] hip to knee to ankle, from a child of eight years to a very tall adult
 STRAIGHT = 0.7  # cosine between trunk and each leg bone of a standing figure, at least
 ERECT = 0.8  # mean cosine between trunk and an axis that is taken for up
+GROUND = 0.25  # lengths of the leg from the origin's height, within which the lowest joint of a standing figure is
 REST_BEND = np.radians(15.0)  # of elbows and knees in a frame that shows the zero pose
 LEAST_JUMP = 5.0  # [rad/s] slower steps after the first frame are no jumps
 JUMP_RATIO = 4.0  # how much faster than the next steps a jump is
 _TRUNK = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
 _SEARCHED = 400  # frames among which a zero pose is looked for
+
+
+def whole_rate(rate: float) -> float:
+    """Return a rate [1/s], or the whole number that it is but for the digits of the time between its frames."""
+    return float(round(rate)) if abs(round(rate) - rate) < RATE_DIGITS * rate else rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +59,8 @@ class Recording:
         turns: for each node its world rotations since the zero pose, ``num_frames`` in each.
         positions: shape ``(num_frames, N, 3)``.
         source: file that it comes from.
-        humanoid: nodes of VRM's bones, where the file names them.
-        up: axis that points up in the world, where the format fixes it, shape ``(3,)``.
+        joint_map: nodes of our joints, where the file's reader finds them.
+        world: rotation from the file's world to ours, where the format fixes it; else the zero pose is upright in it.
 
     Raises:
         ValueError: positions that are not finite.
@@ -67,8 +74,8 @@ class Recording:
     turns: list[Rotation]
     positions: np.ndarray
     source: str
-    humanoid: Mapping[str, int] | None = None
-    up: np.ndarray | None = None
+    joint_map: JointMap | None = None
+    world: Rotation | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.positions).all() and np.isfinite(self.zero).all()):
@@ -87,8 +94,7 @@ class Recording:
         """Return the recording seen in a mirror normal to its x axis; names stay."""
         turns = [Rotation.from_quat(turn.as_quat() * [1.0, -1.0, -1.0, 1.0]) for turn in self.turns]
         flip = np.array([-1.0, 1.0, 1.0])
-        up = None if self.up is None else self.up * flip
-        return replace(self, zero=self.zero * flip, turns=turns, positions=self.positions * flip, up=up)
+        return replace(self, zero=self.zero * flip, turns=turns, positions=self.positions * flip)
 
 
 def to_motion(recording: Recording, rest_joints: np.ndarray, mapping: Mapping[str, str] | None = None) -> Motion:
@@ -104,7 +110,9 @@ def to_motion(recording: Recording, rest_joints: np.ndarray, mapping: Mapping[st
     Raises:
         ValueError: nodes for the limbs are not found, or the legs have no length.
     """
-    joint_map = map_joints(recording.names, recording.parents, recording.zero, recording.humanoid, mapping)
+    joint_map = recording.joint_map
+    if joint_map is None:
+        joint_map = map_joints(recording.names, recording.parents, recording.zero, mapping=mapping)
     notes = list(joint_map.notes)
     if shows_rest_first(recording, joint_map):
         recording = recording.from_frame(1)
@@ -210,32 +218,38 @@ def _axes(up: np.ndarray, across: np.ndarray) -> np.ndarray:
 
 def _up_of_frames(recording: Recording, joint_map: JointMap) -> np.ndarray:
     """Return the signed axis along which the trunk points most, over all frames."""
-    if recording.up is not None:
-        return recording.up
-    mean = _mean_trunk(recording, joint_map)
-    axis = np.zeros(3)
-    axis[np.abs(mean).argmax()] = np.sign(mean[np.abs(mean).argmax()])
-    return axis
+    if recording.world is not None:
+        return recording.world.inv().apply([0.0, 0.0, 1.0])
+    return _nearest_axis(_mean_trunk(recording, joint_map))
 
 
 def _to_world(recording: Recording, joint_map: JointMap, from_zero: Rotation) -> tuple[Rotation, tuple[str, ...]]:
-    """Return the rotation from the recording's world to ours, and a note where its up is not the zero pose's.
+    """Return the rotation from the recording's world to ours, and a note where its up is not what it should be.
 
     Some programs write a zero pose that is y-up into a world that is z-up, and stand the figure up by its root.
     """
-    trunk = from_zero.apply(_mean_trunk(recording, joint_map))
-    axis = np.zeros(3)
-    axis[np.abs(trunk).argmax()] = np.sign(trunk[np.abs(trunk).argmax()])
-    if recording.up is not None or axis[2] != 0.0 or np.abs(trunk).max() < ERECT:
-        return from_zero, ()
-    places = from_zero.apply(recording.positions[:, list(joint_map.nodes.values())].reshape(-1, 3))
+    usual = from_zero
+    # a zero pose that faces backwards is turned forwards, one that lies leaves the world as it is
+    if recording.world is not None and (from_zero * recording.world.inv()).apply([0.0, 0.0, 1.0])[2] < 1.0 - 1e-6:
+        usual = recording.world
+    trunk = usual.apply(_mean_trunk(recording, joint_map))
+    axis = _nearest_axis(trunk)
+    if axis[2] != 0.0 or np.abs(trunk).max() < ERECT:
+        return usual, ()
+    places = usual.apply(recording.positions[:, list(joint_map.nodes.values())].reshape(-1, 3))
     heights = (places @ axis).reshape(len(recording.positions), -1)
     leg = leg_length(joints_of(joint_map, recording.zero))
-    if abs(np.median(heights.min(axis=1))) > 0.25 * leg:  # a figure that stands does so near the origin's height
-        return from_zero, ()
-    note = "the figure stands along another axis than its zero pose: that axis is taken for up"
+    if abs(np.median(heights.min(axis=1))) > GROUND * leg:  # a figure that stands does so near the origin's height
+        return usual, ()
+    note = "the figure stands along another axis than its zero pose or its format: that axis is taken for up"
     warnings.warn(f"{recording.source}: {note}", stacklevel=4)
-    return shortest_rotation(axis, np.array([0.0, 0.0, 1.0])) * from_zero, (note,)
+    return shortest_rotation(axis, np.array([0.0, 0.0, 1.0])) * usual, (note,)
+
+
+def _nearest_axis(vector: np.ndarray) -> np.ndarray:
+    """Return the signed axis that is nearest to a vector, shape ``(3,)``."""
+    place = int(np.abs(vector).argmax())
+    return np.sign(vector[place]) * np.eye(3)[place]
 
 
 def _mean_trunk(recording: Recording, joint_map: JointMap) -> np.ndarray:
