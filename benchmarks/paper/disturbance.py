@@ -14,7 +14,6 @@ import numpy as np
 from benchmarks.paper.poses import random_directions, random_poses, random_shapes
 from benchmarks.physics.rig import Rig, World
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
-from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.mpm.diagnostics import Totals, totals
 
@@ -91,7 +90,7 @@ def struck_free(world: World, control: PoseControlConfig, seeds: int, steps: int
     bones = np.repeat([joint_index(name) for name in STRIKES], seeds)
     size = np.repeat(list(STRIKES.values()), seeds)
     directions = np.tile(random_directions(rng, seeds), (len(STRIKES), 1))
-    shapes = np.tile(random_shapes(load_asset(), rng, seeds), (len(STRIKES), 1))
+    shapes = np.tile(random_shapes(world.asset, rng, seeds), (len(STRIKES), 1))
     poses = np.tile(random_poses(rng, seeds, POSE_RANGE)[0], (len(STRIKES), 1, 1))
     rig = Rig(world, control, shapes)
     course = follow(rig, poses, bones, size[:, None] * directions, steps)
@@ -104,7 +103,7 @@ def struck_free(world: World, control: PoseControlConfig, seeds: int, steps: int
 def hit_by_balls(world: World, control: PoseControlConfig, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
     """Yield rows of a standing body, its root held by the wrench, under the impulses of balls on its chest."""
     rng = np.random.default_rng(4)
-    shapes = np.tile(random_shapes(load_asset(), rng, seeds), (len(BALLS), 1))
+    shapes = np.tile(random_shapes(world.asset, rng, seeds), (len(BALLS), 1))
     size = np.repeat([ball.impulse for ball in BALLS], seeds)
     rig = Rig(world, control, shapes)
     bones = np.full(len(shapes), joint_index("spine3"))

@@ -56,8 +56,10 @@ def passing_through(rotations: np.ndarray, shifts: np.ndarray, steps: int) -> tu
 
 
 def random_shapes(asset: AvatarAsset, rng: np.random.Generator, count: int) -> np.ndarray:
-    """Draw shape parameters of ``count`` bodies, the sexes alternating, shape ``(count, S)``."""
+    """Draw shape parameters of ``count`` bodies, the sexes alternating if that is one, shape ``(count, S)``."""
     shapes = asset.sample_parameters(rng, count)
+    if "sex" not in asset.shape_names:
+        return shapes
     shapes[:, asset.shape_names.index("sex")] = np.where(np.arange(count) % 2 == 0, -1.0, 1.0)
     return shapes
 

@@ -20,7 +20,6 @@ from benchmarks.paper.metrics import distance_metrics, pose_metrics, spread
 from benchmarks.paper.poses import passing_through, random_directions, random_poses, random_shapes
 from benchmarks.physics.rig import Rig, World
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.config import replace as changed
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -50,6 +49,10 @@ class Options(runner.Options):
     struck_poses: int = 30
     #: repetitions of Table 1 with twice as fine a grid; 0 leaves it out
     medium_seeds: int = 2
+    #: a model file of SMPL, SMPL-H or SMPL-X, tracked in place of the embedded body
+    model: str | None = None
+    #: mesh of a skeleton, or a folder of its parts, for bone particles
+    skeleton: str | None = None
     #: a minute's smoke run: few poses of a tiny body; the figures mean nothing
     quick: bool = False
     #: draw the pictures beside the JSON file
@@ -66,7 +69,10 @@ def shortened(options: Options) -> Options:
 def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Yield all rows of the benchmark."""
     chosen = shortened(options)
-    world = World(fidelity="tiny" if options.quick else "coarse", device=options.device)
+    settings = {"source": "embedded" if options.model is None else "smplx"}
+    settings |= {"path": options.model} if options.model else {}
+    settings |= {"skeleton": options.skeleton} if options.skeleton else {}
+    world = World(fidelity="tiny" if options.quick else "coarse", avatar=tuple(settings.items()), device=options.device)
     bar = runner.progress(list(plan(chosen, world)), "tracking")
     rows: list[dict[str, Any]] = []
     for run in bar:
@@ -109,9 +115,12 @@ def plan(options: Options, world: World) -> Iterator[Any]:
         where = replace(world, decoupling=variant)
         yield lambda where=where: table_2(options, where, usual, options.struck_poses, strike=STRIKE)
     few = replace(options, sequences=min(2, options.sequences))
-    for rings in (4, 8 if options.quick else 40):
+    ten_times = [{"bone_rings": rings} for rings in (4, 8 if options.quick else 40)]
+    if options.skeleton:  # points of a surface
+        ten_times = [{"bone_voxel": voxel} for voxel in (1.0, 0.7 if options.quick else 10.0**-0.5)]
+    for number in ten_times:
         for variant in ("split", "paper"):
-            where = replace(world, decoupling=variant, bone_rings=rings)
+            where = replace(world, decoupling=variant, **number)
             yield lambda where=where: bone_particles(few, where)
     yield from disturbance.plan(options.seeds, options.quick, world)
 
@@ -150,7 +159,7 @@ def run_sequences(
 ) -> list[dict[str, float]]:
     """Run one repetition of Table 1 and return metrics after each of the four poses, over all bodies."""
     rng = np.random.default_rng([seed, 1])
-    shapes = random_shapes(load_asset(), rng, sequences)
+    shapes = random_shapes(world.asset, rng, sequences)
     rotations, shifts = random_poses(rng, sequences * FRAMES)
     rotations = rotations.reshape(sequences, FRAMES, -1, 3)
     shifts = shifts.reshape(sequences, FRAMES, 3)
@@ -195,7 +204,7 @@ def table_2(
     into the pose it should have, and counted. With ``strike`` [N s], a forearm is struck before every tenth step.
     """
     rngs = [np.random.default_rng([seed, 2]) for seed in range(options.seeds)]
-    shapes = np.concatenate([random_shapes(load_asset(), rng, 2)[seed % 2][None] for seed, rng in enumerate(rngs)])
+    shapes = np.concatenate([random_shapes(world.asset, rng, 2)[seed % 2][None] for seed, rng in enumerate(rngs)])
     courses = [passing_through(*random_poses(rng, poses), steps_per_pose) for rng in rngs]
     rotations, shifts = (np.stack(parts, axis=1) for parts in zip(*courses, strict=True))
     rig = Rig(world, control, shapes)
@@ -241,10 +250,10 @@ def table_2(
 def bone_particles(options: Options, world: World) -> Iterator[dict[str, Any]]:
     """Yield error and cost with ten times as many bone particles, in the last frame of Table 1's protocol."""
     samples = [run_sequences(world, BARE, options.sequences, seed)[-1] for seed in range(options.seeds)]
-    rig = Rig(world, BARE, np.zeros((1, len(load_asset().shape_names))))
+    rig = Rig(world, BARE, np.zeros((1, len(world.asset.shape_names))))
     trackers = np.bincount(rig.points.bone[~rig.flesh])
     yield {
-        "case": label("bone particles", world, BARE, 0.0) + f", {5 * world.bone_rings} a joint",
+        "case": label("bone particles", world, BARE, 0.0) + f", {trackers.mean():.0f} a joint",
         "table": None,
         "study": "bone particles",
         "decoupling": world.decoupling,

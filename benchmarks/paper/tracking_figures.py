@@ -12,7 +12,6 @@ import numpy as np
 from benchmarks.paper import metrics as paper
 from benchmarks.paper.poses import random_poses, random_shapes
 from benchmarks.physics.rig import Rig, World
-from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.core.arrays import matrices_of
 
@@ -100,7 +99,7 @@ def draw_strain(path: Path, world: World) -> None:
 
     rng = np.random.default_rng(12)
     rotations, shifts = random_poses(rng, 4)
-    shapes, panels = random_shapes(load_asset(), rng, 1), []
+    shapes, panels = random_shapes(world.asset, rng, 1), []
     with Renderer(SIZE, SIZE, Camera(position=(1.1, -3.7, 1.25), target=(0.0, 0.0, 0.98))) as renderer:
         for decoupling, title in TITLES.items():
             control = PoseControlConfig(tone=0.0, alpha=0.0, root="free", free_motion=False)

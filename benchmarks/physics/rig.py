@@ -11,8 +11,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.avatar import Avatar
+from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints
-from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
+from piavatar_envs.avatar.body.sampling import ParticleSet, morph, sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.pose_control.controller import PoseController
@@ -42,6 +43,8 @@ class World:
         gravity: along -z [m/s^2].
         ground: a floor at z = 0.
         bone_rings: rings of five bone particles along every bone.
+        bone_voxel: edge of the cubes that have one point of a skeleton each, over the spacing of particles.
+        avatar: names and values of the body's settings, as ``(("source", "smplx"), ("path", FILE))``.
         device: Warp device.
     """
 
@@ -51,7 +54,18 @@ class World:
     gravity: float = 0.0
     ground: bool = False
     bone_rings: int = 4
+    bone_voxel: float = 1.0
+    avatar: tuple[tuple[str, str], ...] = ()
     device: str = "cpu"
+
+    @property
+    def asset(self) -> AvatarAsset:
+        """The body, in all of its shapes."""
+        return load_asset(**dict(self.avatar))
+
+    def sample(self, spacing: float) -> ParticleSet:
+        """Return the particles of the body's mean shape."""
+        return sample_particles(self.asset, spacing, bone_rings=self.bone_rings, bone_voxel=self.bone_voxel)
 
 
 class Rig:
@@ -65,11 +79,12 @@ class Rig:
     def __init__(self, world: World, control: PoseControlConfig, shapes: np.ndarray) -> None:
         """Build a body for each row of ``shapes`` (shape parameters, ``(num_envs, S)``) and place them."""
         self.world, self.num_envs = world, len(shapes)
-        asset = self.asset = load_asset()
+        asset = self.asset = world.asset
         self.dx = float(np.ptp(asset.mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[world.fidelity]
-        particles = sample_particles(asset, spacing_for(self.dx), bone_rings=world.bone_rings)
+        particles = world.sample(spacing_for(self.dx))
         self.shaped = [asset.shape(parameters) for parameters in shapes]
-        morphed = [_morphed(tuple(map(float, row)), spacing_for(self.dx), world.bone_rings) for row in shapes]
+        bodies = World(bone_rings=world.bone_rings, bone_voxel=world.bone_voxel, avatar=world.avatar)
+        morphed = [_morphed(tuple(map(float, row)), spacing_for(self.dx), bodies) for row in shapes]
         volume = np.array([volumes for _, volumes in morphed])
         self.points = BodyPoints(
             rest=np.array([rest for rest, _ in morphed]),
@@ -233,10 +248,9 @@ def joint_gaps(tracked: Tracked, joints: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _morphed(parameters: tuple[float, ...], spacing: float, bone_rings: int) -> tuple[np.ndarray, np.ndarray]:
+def _morphed(parameters: tuple[float, ...], spacing: float, world: World) -> tuple[np.ndarray, np.ndarray]:
     """Return rest positions [m] and volumes [m^3] of a shape's particles; all variants use the same bodies."""
-    asset = load_asset()
-    return morph(asset, sample_particles(asset, spacing, bone_rings=bone_rings), asset.shape(parameters))
+    return morph(world.asset, world.sample(spacing), world.asset.shape(parameters))
 
 
 @wp.kernel
