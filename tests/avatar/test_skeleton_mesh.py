@@ -12,6 +12,8 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS,
 from piavatar_envs.avatar.body.skeleton_mesh import STEP, bone_of_name, nearest_bones, read_skeleton, thinned
 from piavatar_envs.avatar.body.sources import load_asset
 from scripts.synthetic_smplx import TO_SMPL, synthetic_model
+from tests.avatar.gltf_files import Y_UP, rig_of
+from tests.avatar.test_rigs import named
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh, of the extra props, is not installed")
 
@@ -132,6 +134,20 @@ def test_a_skeleton_of_the_zero_pose_is_moved_with_its_bones(tmp_path):
     for bone in LIMBS:
         own = asset.skeleton.points[asset.skeleton.bone == joint_index(bone)]
         assert axis_distance(own, asset.joints.astype(float), bone).max() < RADIUS + 1e-4
+
+
+def test_a_skeleton_beside_a_character_in_centimetres(joints, tmp_path):
+    """It is in the file's unit and axes, y up; the bodies of both are the embedded one."""
+    rig_of(load_asset(), named("mixamo"), unit=100.0).write().save(tmp_path / "character.glb")
+    standing = load_asset().mean_body().joints.astype(np.float64)
+    (tmp_path / "parts").mkdir()
+    for bone in LIMBS:
+        tube(100.0 * standing @ Y_UP.T, bone, 100.0 * RADIUS).export(tmp_path / "parts" / f"{bone}.stl")
+    asset = load_asset("glb", path=tmp_path / "character.glb", skeleton=str(tmp_path / "parts"))
+    for bone in LIMBS:
+        own = asset.skeleton.points[asset.skeleton.bone == joint_index(bone)]
+        assert axis_distance(own, asset.joints.astype(float), bone).max() < RADIUS + 1e-4
+        assert len(own) > 100
 
 
 def test_every_axis_is_nearest_to_its_own_bone(joints):

@@ -18,6 +18,7 @@ from piavatar_envs.avatar.body.asset import AvatarAsset, Look, PoseDisplacements
 from piavatar_envs.avatar.body.closed_skin import CELL, ClosedSkin, close_skin, read_soup
 from piavatar_envs.avatar.body.rigs import spread_weights
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.skeleton_mesh import moved, read_skeleton
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs
 from piavatar_envs.core.result_cache import digest_of, kept
 
@@ -64,6 +65,7 @@ class Character:
         notes: what was guessed in reading it, such as the unit.
         pose: displacements of the vertices that depend on the pose, for the look; only of a character that rests in
             the reference pose already.
+        placement: matrix ``(3, 3)`` and origin ``(3,)`` [m] of our coordinates: ``vertex = matrix file - origin``.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Character:
     shape_joints: np.ndarray
     notes: tuple[str, ...] = ()
     pose: PoseDisplacements | None = None
+    placement: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def held(self) -> np.ndarray:
@@ -140,6 +143,25 @@ def _closed(character: Character, posed: np.ndarray, cell: float) -> tuple[Close
     shape = (len(found["vertices"]), len(character.vertices))
     anchors = sparse.csr_array((found["data"], found["indices"], found["indptr"]), shape=shape)
     return ClosedSkin(found["vertices"], found["faces"], anchors), found["flipped"], found["part"]
+
+
+def with_skeleton(asset: AvatarAsset, character: Character, path: str | None) -> AvatarAsset:
+    """Return the body of a character with the points of a skeleton that is in its file's rest pose and coordinates.
+
+    Args:
+        asset: of :func:`body_of`.
+        character: in its rest pose.
+        path: one mesh, or a folder of meshes, see :mod:`piavatar_envs.avatar.body.skeleton_mesh`; None for none.
+
+    Raises:
+        FileNotFoundError: there is no such file or folder.
+        ValueError: no mesh is found, one cannot be read, or they are far from the body or of another size.
+    """
+    if path is None:
+        return asset
+    found = read_skeleton(path, character.joints, *(character.placement or ()))
+    places = asset.joints.astype(np.float64)
+    return replace(asset, skeleton=moved(found, character.joints, reference_rotations(character.joints), places))
 
 
 def to_reference_pose(character: Character) -> Character:

@@ -44,13 +44,16 @@ ANATOMY: tuple[tuple[str, str], ...] = (
 )
 
 
-def read_skeleton(path: str | Path, joints: np.ndarray, axes: np.ndarray | None = None) -> SkeletonPoints:
+def read_skeleton(
+    path: str | Path, joints: np.ndarray, axes: np.ndarray | None = None, origin: np.ndarray | None = None
+) -> SkeletonPoints:
     """Read the points of a skeleton in the pose of ``joints``.
 
     Args:
         path: one mesh, or a folder of meshes.
         joints: joints of the body in the same pose, in our axes [m], shape ``(22, 3)``.
-        axes: matrix from the file's axes to ours, shape ``(3, 3)``; by default they are the same.
+        axes: matrix from the file's coordinates to ours, shape ``(3, 3)``; by default they are the same.
+        origin: of our coordinates, in the file's axes turned by the matrix [m], shape ``(3,)``; zero by default.
 
     Returns:
         Points in our axes, at most one in a cube of :data:`STEP` of each bone.
@@ -62,11 +65,12 @@ def read_skeleton(path: str | Path, joints: np.ndarray, axes: np.ndarray | None 
     """
     path = Path(path)
     axes = np.eye(3) if axes is None else np.asarray(axes)
+    origin = np.zeros(3) if origin is None else np.asarray(origin)
     span = np.ptp(joints, axis=0).max()
     parts = {}
     for file in _files(path):
         corners, loose = _surface(file)
-        parts[file] = corners @ axes.T, loose @ axes.T
+        parts[file] = corners @ axes.T - origin, loose @ axes.T - origin
     ends = np.concatenate([part.reshape(-1, 3) for pair in parts.values() for part in pair])
     distance, size = np.linalg.norm(ends - joints.mean(axis=0), axis=1).max(), np.ptp(ends, axis=0).max()
     if distance > 2.0 * span or size < 0.1 * span:

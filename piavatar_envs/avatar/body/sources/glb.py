@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
-from piavatar_envs.avatar.body.character import HEIGHTS, Character, Surface, body_of
+from piavatar_envs.avatar.body.character import HEIGHTS, Character, Surface, body_of, with_skeleton
 from piavatar_envs.avatar.body.rigs import (
     JointMap,
     axes_of,
@@ -34,19 +34,23 @@ UNITS = {"centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "millimetres": 0
 LIKELY_HEIGHTS = (1.0, 2.4)
 
 
-def build(path: str, height: float | None = None, mapping: str | None = None) -> AvatarAsset:
+def build(
+    path: str, height: float | None = None, mapping: str | None = None, skeleton: str | None = None
+) -> AvatarAsset:
     """Return the body of a skinned character.
 
     Args:
         path: of a ``.glb``, ``.gltf`` or ``.vrm`` file.
         height: that the character, from its soles to the top of its hair, is scaled to [m]; as the file has it if None.
         mapping: of a JSON file from our joints to names of the file's nodes, for rigs whose names say nothing.
+        skeleton: mesh of a skeleton, or a folder of its parts, in the file's rest pose and coordinates.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it cannot be read, its rig lacks a joint, or its height is no person's.
     """
-    return body_of(read_character(path, height, mapping))
+    character = read_character(path, height, mapping)
+    return with_skeleton(body_of(character), character, skeleton)
 
 
 def read_character(path: str | Path, height: float | None = None, mapping: str | Path | None = None) -> Character:
@@ -99,6 +103,7 @@ def read_character(path: str | Path, height: float | None = None, mapping: str |
         shape_deltas=np.zeros((0, 2, len(places), 3)),
         shape_joints=np.zeros((0, 2, NUM_JOINTS, 3)),
         notes=tuple(notes),
+        placement=(scale * axes, origin),
     )
 
 
