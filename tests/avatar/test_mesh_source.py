@@ -10,6 +10,7 @@ import pytest
 from piavatar_envs.avatar.body.character import Character
 from piavatar_envs.avatar.body.registration import Registered
 from piavatar_envs.avatar.body.sampling import sample_particles
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset, mesh, source_of
 from tests.avatar.characters import in_t_pose
 
@@ -103,3 +104,16 @@ def test_files_that_are_no_surface_are_refused(tmp_path, name, content, message)
         mesh.build(str(tmp_path / name))
     with pytest.raises(FileNotFoundError):
         mesh.build(str(tmp_path / "none.obj"))
+
+
+def test_a_skeleton_is_in_the_coordinates_of_the_file(person, file, read, tmp_path):
+    names = {"left_hip": "left_knee", "right_knee": "right_ankle", "left_shoulder": "left_elbow"}
+    for bone, end in names.items():
+        ends = 100.0 * person.joints[[joint_index(bone), joint_index(end)]][:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        trimesh.creation.cylinder(0.8, segment=ends).export(tmp_path / f"{bone}.ply")
+    body = load_asset("mesh", path=str(file), skeleton=str(tmp_path))
+    for bone, end in names.items():
+        start, stop = body.joints[joint_index(bone)], body.joints[joint_index(end)]
+        axis = (stop - start) / np.linalg.norm(stop - start)
+        own = body.skeleton.points[body.skeleton.bone == joint_index(bone)]
+        assert np.linalg.norm(np.cross(own - start, axis), axis=1).max() < 0.03  # as the registered joints

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
-from piavatar_envs.avatar.body.character import HEIGHTS, Character, Surface, body_of
+from piavatar_envs.avatar.body.character import HEIGHTS, Character, Surface, body_of, with_skeleton
 from piavatar_envs.avatar.body.closed_skin import read_soup
 from piavatar_envs.avatar.body.registration import Registered, register
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
@@ -26,24 +26,28 @@ FORMATS = (*SUFFIXES, ".glb", ".gltf")
 MOST_RESIDUAL = 0.015
 #: Units that a height is tried in [m].
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
+#: Our axes from those of a file in which y points up.
+_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 #: Colour of surfaces without one.
 _CLAY = (219, 194, 176)
 
 
-def build(path: str, height: float | None = None, up: str | None = None) -> AvatarAsset:
+def build(path: str, height: float | None = None, up: str | None = None, skeleton: str | None = None) -> AvatarAsset:
     """Return the body of a surface.
 
     Args:
         path: of the file.
         height: of the body [m]; by default the file's own, in metres, centimetres or millimetres.
         up: axis that points up, ``"y"`` or ``"z"``; found by the proportions of a person if not given.
+        skeleton: mesh of a skeleton, or a folder of its parts, in the file's coordinates.
 
     Raises:
         FileNotFoundError: there is no such file.
         ImportError: trimesh is not installed.
         ValueError: the file cannot be read, has no person's height, or the body does not fit to it.
     """
-    return body_of(read_character(path, height, up))
+    character = read_character(path, height, up)
+    return with_skeleton(body_of(character), character, skeleton)
 
 
 def read_character(path: str, height: float | None = None, up: str | None = None) -> Character:
@@ -54,10 +58,12 @@ def read_character(path: str, height: float | None = None, up: str | None = None
         raise ValueError(f"up={up!r} is no axis that points up; use y or z")
     found = []
     for axis in [up] if up else _possible_ups(vertices, Path(path).suffix.lower()):
-        upright = vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0] if axis == "y" else vertices
+        matrix = _Y_UP if axis == "y" else np.eye(3)
+        upright = vertices @ matrix.T
         scaled, note = _in_metres(name, upright, height)
-        found.append((_registered(name, scaled, faces), scaled, (f"{axis} points up", *note)))
-    registered, scaled, notes = min(found, key=lambda one: one[0].residual)
+        matrix = matrix * (np.ptp(scaled[:, 2]) / np.ptp(upright[:, 2]))
+        found.append((_registered(name, scaled, faces), scaled, matrix, (f"{axis} points up", *note)))
+    registered, scaled, matrix, notes = min(found, key=lambda one: one[0].residual)
     tall = float(np.ptp(scaled[:, 2]))
     if registered.residual > MOST_RESIDUAL:
         raise ValueError(
@@ -78,6 +84,7 @@ def read_character(path: str, height: float | None = None, up: str | None = None
         shape_deltas=np.zeros((0, 2, len(vertices), 3)),
         shape_joints=np.zeros((0, 2, NUM_JOINTS, 3)),
         notes=(*notes, f"the registered body is {100.0 * registered.residual * tall:.2f} cm away on average"),
+        placement=(turn.T @ matrix, np.zeros(3)),
     )
 
 
