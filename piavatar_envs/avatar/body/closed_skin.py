@@ -14,6 +14,7 @@ SIGGRAPH 1987). Its largest piece is kept and its cavities are filled.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -128,7 +129,7 @@ def read_soup(vertices: np.ndarray, faces: np.ndarray, held: np.ndarray | None =
     held = np.zeros(len(faces), bool) if held is None else np.asarray(held, bool)
     place = _welded(vertices)
     count = int(place.max()) + 1
-    rows = _distinct(place[faces])
+    rows = distinct(place[faces])
     welded = place[faces[rows]]
     means = sparse.csr_array((np.ones(len(place)), (place, np.arange(len(place)))), shape=(count, len(place)))
     means = sparse.csr_array(sparse.diags_array(1.0 / means.sum(axis=1)) @ means)
@@ -224,16 +225,24 @@ class _Edges:
 
 def _welded(vertices: np.ndarray) -> np.ndarray:
     """Return for every vertex the number of the place that it is at, shape ``(V,)``."""
-    cells = np.round(vertices / WELD).astype(np.int64)
-    return np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+    return unique_rows(np.round(vertices / WELD).astype(np.int64))[1]
 
 
-def _distinct(faces: np.ndarray) -> np.ndarray:
+def distinct(faces: np.ndarray) -> np.ndarray:
     """Return rows of triangles with three corners, of those with the same corners (two sides of a sheet) the first."""
     a, b, c = faces.T
     good = np.flatnonzero((a != b) & (b != c) & (c != a))
-    corners = np.sort(faces[good], axis=1)
-    return np.sort(good[np.unique(corners, axis=0, return_index=True)[1]])
+    return np.sort(good[unique_rows(np.sort(faces[good], axis=1))[0]])
+
+
+def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first of each set of equal rows of integers ``(N, 3)``, and for every row the number of its set."""
+    low = rows.min(axis=0)
+    size = [int(width) + 1 for width in rows.max(axis=0) - low]
+    if math.prod(size) < 2**62:  # one number a row sorts many times faster
+        rows = ((rows - low) * [size[1] * size[2], size[2], 1]).sum(axis=1)
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return first, inverse.ravel()
 
 
 def _shell(points: np.ndarray, faces: np.ndarray, rows: np.ndarray, first: int) -> tuple[Shell, list[np.ndarray]]:

@@ -8,6 +8,8 @@ from scipy.spatial import cKDTree
 
 #: Particles looked at for each vertex, in turn: more only where too few of the nearest share the vertex's bones.
 _CANDIDATES = (64, 256)
+#: Pairs of vertices and particles that are looked at together, which bounds memory.
+_MOST_PAIRS = 1_000_000
 #: A particle with less than this share of the best candidate's overlap moves with other bones: leave it out.
 _MIN_RELATIVE_OVERLAP = 0.05
 #: Least ``det(K) / (tr(K) / 3)^3`` of ``K = sum dX dX^T``: neighbours in a plane or on a line fix no gradient.
@@ -28,18 +30,20 @@ def interpolation_matrix(
     weights = np.zeros((len(vertices), num_neighbours))
     todo = np.arange(len(vertices))
     for count in (*_CANDIDATES, len(particles)):
-        last = count >= len(particles)
-        distance, index = tree.query(vertices[todo], k=np.arange(1, min(count, len(particles)) + 1))
-        overlap = np.einsum("vb,vcb->vc", vertex_weights[todo], particle_weights[index])
-        compatible = overlap > _MIN_RELATIVE_OVERLAP * np.maximum(overlap.max(axis=1, keepdims=True), 0.2)
-        # One more than needed: the kernel falls to zero at the first particle left out, so that weights are smooth.
-        done = (compatible.sum(axis=1) > num_neighbours) | last
-        rows = todo[done]
-        if len(rows):
-            neighbours[rows], weights[rows] = _select(
-                distance[done], index[done], overlap[done], compatible[done], num_neighbours
-            )
-        todo = todo[~done]
+        last, count, left = count >= len(particles), min(count, len(particles)), []
+        for part in np.array_split(todo, 1 + len(todo) * count // _MOST_PAIRS):
+            distance, index = tree.query(vertices[part], k=np.arange(1, count + 1))
+            overlap = np.einsum("vb,vcb->vc", vertex_weights[part], particle_weights[index])
+            compatible = overlap > _MIN_RELATIVE_OVERLAP * np.maximum(overlap.max(axis=1, keepdims=True), 0.2)
+            # One more than needed: the kernel falls to zero at the first particle left out, for smooth weights.
+            done = (compatible.sum(axis=1) > num_neighbours) | last
+            rows = part[done]
+            if len(rows):
+                neighbours[rows], weights[rows] = _select(
+                    distance[done], index[done], overlap[done], compatible[done], num_neighbours
+                )
+            left.append(part[~done])
+        todo = np.concatenate(left)
         if last or not len(todo):
             break
     rows = np.broadcast_to(np.arange(len(vertices))[:, None], neighbours.shape)
