@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 #: Particles looked at for each vertex, in turn: more only where too few of the nearest share the vertex's bones.
 _CANDIDATES = (64, 256)
@@ -32,7 +33,11 @@ def interpolation_matrix(
     for count in (*_CANDIDATES, len(particles)):
         last, count, left = count >= len(particles), min(count, len(particles)), []
         for part in np.array_split(todo, 1 + len(todo) * count // _MOST_PAIRS):
-            distance, index = tree.query(vertices[part], k=np.arange(1, count + 1))
+            if last:  # a tree is slow where it has to sort all that it holds
+                index = np.broadcast_to(np.arange(count), (len(part), count))
+                distance = cdist(vertices[part], particles)
+            else:
+                distance, index = tree.query(vertices[part], k=np.arange(1, count + 1))
             overlap = np.einsum("vb,vcb->vc", vertex_weights[part], particle_weights[index])
             compatible = overlap > _MIN_RELATIVE_OVERLAP * np.maximum(overlap.max(axis=1, keepdims=True), 0.2)
             # One more than needed: the kernel falls to zero at the first particle left out, for smooth weights.
