@@ -39,7 +39,8 @@ def examine(path: Path, settings: Mapping[str, Any] | None = None, picture: Path
 
     Args:
         path: of a character or a motion.
-        settings: of the source that reads it, such as ``height`` and ``mapping``.
+        settings: of the source that reads it, such as ``height`` and ``mapping``; ``source`` names another one than the
+            file's ending.
         picture: file to write the body and its skeleton to, from the front and the side.
 
     Raises:
@@ -55,14 +56,16 @@ def examine(path: Path, settings: Mapping[str, Any] | None = None, picture: Path
     suffix = path.suffix.lower()
     report: Report = {"file": f"{path}, {path.stat().st_size / 2**20:.2f} MiB"}
     gltf = read_gltf(path) if suffix in GLTF else None
-    if suffix in MOTIONS or _is_recording(path) or (gltf is not None and gltf.animations and not _is_character(gltf)):
+    moves = suffix in MOTIONS or _is_recording(path) or (gltf and gltf.animations and not _is_character(gltf))
+    if moves and "source" not in settings:
         if picture is not None:
             raise ValueError(f"{path} is a motion, of which there is no picture; leave --picture out")
         motions = (
             [str(path)] if gltf is None else [f"{path}#{a.name}" if a.name else str(path) for a in gltf.animations]
         )
         return report | {"motions": [_motion(motion, settings) for motion in motions]}
-    source = sources.source_of(path)
+    source = settings.pop("source", None) or sources.source_of(path)
+    sources.check_source(source)
     module = importlib.import_module(f"{sources.__name__}.{source}")
     asset = sources.load_asset(source, path, **settings)
     report["source"] = source

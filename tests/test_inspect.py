@@ -95,6 +95,14 @@ def test_mistakes_end_in_one_line(name, args, words, tmp_path, capsys):
     assert stop.value.code == 2 and words in error and error.count("\n") == 1
 
 
+def test_another_source_may_be_named(knight, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["inspect", str(knight), "-c", "source=mash"])
+    assert "unknown avatar source 'mash'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="'mesh' has no setting mapping='a'"):
+        inspection.examine(knight, {"source": "mesh", "mapping": "a"})
+
+
 def test_unknown_settings_and_files_are_refused(knight, tmp_path):
     with pytest.raises(ValueError, match=r"no setting tall=2; it has path, height, mapping"):
         inspection.examine(knight, {"tall": 2})

@@ -93,8 +93,8 @@ def read_surfaces(gltf: Gltf) -> Surfaces:
             leads = [transform[0] for transform in transforms]
         else:
             world, leads = bound
-            size = float(np.ptp(world[:, :3, 3], axis=0).max())
-            if np.abs(world[:, :3, 3] - gltf.world[:, :3, 3]).max() > 2.0 * SAME_PLACE * size:
+            moved = np.abs(world[:, :3, 3] - gltf.world[:, :3, 3])
+            if gltf.skins and moved.max() > 2.0 * SAME_PLACE * float(np.ptp(world[:, :3, 3], axis=0).max()):
                 reader.notes.append("the file shows another pose than its skin was bound in, which is taken")
             places = [
                 _moved(piece.points, world[piece.node] if piece.skin is None else leads[piece.skin]) for piece in pieces

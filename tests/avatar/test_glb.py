@@ -151,6 +151,13 @@ def test_a_file_without_a_skin_is_another_source(asset, tmp_path):
         read_character(out.save(tmp_path / "a.glb"))
 
 
+def test_a_file_without_nodes_is_refused(tmp_path):
+    path = tmp_path / "a.gltf"
+    path.write_text('{"asset": {"version": "2.0"}}')
+    with pytest.raises(ValueError, match="no skinned mesh"):
+        read_character(path)
+
+
 def test_mapping_and_errors_of_the_rig(asset, standing, tmp_path):
     names = [f"Bone.{index:03d}" for index in range(22)]
     path = rig_of(asset, names).write().save(tmp_path / "a.glb")
