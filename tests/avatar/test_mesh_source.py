@@ -13,6 +13,8 @@ from piavatar_envs.avatar.body.sampling import sample_particles
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset, mesh, source_of
 from tests.avatar.characters import in_t_pose
+from tests.avatar.gltf_files import rig_of
+from tests.avatar.test_rigs import named
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -117,3 +119,11 @@ def test_a_skeleton_is_in_the_coordinates_of_the_file(person, file, read, tmp_pa
         axis = (stop - start) / np.linalg.norm(stop - start)
         own = body.skeleton.points[body.skeleton.bone == joint_index(bone)]
         assert np.linalg.norm(np.cross(own - start, axis), axis=1).max() < 0.03  # as the registered joints
+
+
+def test_a_quantised_glb_without_its_skin_is_a_surface(tmp_path):
+    rig = rig_of(load_asset(), named("mixamo"), storage="quantized", material={"name": "skin"})
+    path = rig.write().save(tmp_path / "a.glb")
+    vertices, faces, colors = mesh._load(path)
+    assert np.ptp(vertices[:, 1]) == pytest.approx(np.ptp(rig.vertices[:, 2]), abs=1e-4)
+    assert len(faces) == len(rig.faces) and (colors == 255).all()

@@ -14,14 +14,17 @@ from piavatar_envs.avatar.body.closed_skin import read_soup
 from piavatar_envs.avatar.body.registration import Registered, register
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.body.sources import embedded
+from piavatar_envs.avatar.gltf import read_gltf
+from piavatar_envs.avatar.gltf_surfaces import read_surfaces
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.reading import reading
 from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Endings of files that only this source reads.
 SUFFIXES = (".obj", ".ply", ".stl", ".off")
+_GLTF = (".glb", ".gltf")
 #: All formats that it reads.
-FORMATS = (*SUFFIXES, ".glb", ".gltf")
+FORMATS = (*SUFFIXES, *_GLTF)
 #: Greatest mean distance between the surface and the registered body, over the height.
 MOST_RESIDUAL = 0.015
 #: Units that a height is tried in [m].
@@ -43,7 +46,7 @@ def build(path: str, height: float | None = None, up: str | None = None, skeleto
 
     Raises:
         FileNotFoundError: there is no such file.
-        ImportError: trimesh is not installed.
+        ImportError: trimesh is not installed, which other files than glTF need.
         ValueError: the file cannot be read, has no person's height, or the body does not fit to it.
     """
     character = read_character(path, height, up)
@@ -90,14 +93,37 @@ def read_character(path: str, height: float | None = None, up: str | None = None
 
 def _load(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, triangles and sRGB colours of a file, in its own unit and axes."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise missing("an avatar from a mesh", "trimesh", "props") from error
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(FORMATS)}")
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
+    vertices, faces, colors = (_load_gltf if path.suffix.lower() in _GLTF else _load_other)(path)
+    if not len(faces):
+        raise ValueError(f"{path.name} has no triangles; export a surface, not points, curves or an empty scene")
+    if not np.isfinite(vertices).all():
+        raise ValueError(f"{path.name} has vertices that are not finite; export it again")
+    return vertices, faces, colors.reshape(len(vertices), 3)
+
+
+def _load_gltf(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, triangles and colours of a glTF file; skins and held things are surfaces as any other."""
+    surfaces = read_surfaces(read_gltf(path))
+    counts = [len(places) for places in surfaces.places]
+    starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    faces = [start + own for start, own in zip(starts, surfaces.faces, strict=False)]
+    return (
+        np.concatenate([np.zeros((0, 3)), *surfaces.places]),
+        np.concatenate([np.zeros((0, 3), np.int64), *faces]),
+        np.concatenate([np.zeros((0, 3), np.uint8), *(piece.colors for piece in surfaces.pieces)]),
+    )
+
+
+def _load_other(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, triangles and colours of a file that trimesh reads."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise missing("an avatar from a mesh", "trimesh", "props") from error
     with reading(path.name, f"a readable {path.suffix} mesh"):
         # a stream, not a path: nothing is looked up next to it
         stream, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
@@ -108,16 +134,12 @@ def _load(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             colors = np.array(loaded.visual.to_color().vertex_colors, np.uint8)[:, :3]
         elif loaded.visual.kind in ("vertex", "face"):
             colors = np.array(loaded.visual.vertex_colors, np.uint8)[:, :3]
-    if not len(faces):
-        raise ValueError(f"{path.name} has no triangles; export a surface, not points, curves or an empty scene")
-    if not np.isfinite(vertices).all():
-        raise ValueError(f"{path.name} has vertices that are not finite; export it again")
-    return vertices, faces, colors.reshape(len(vertices), 3)
+    return vertices, faces, colors
 
 
 def _possible_ups(vertices: np.ndarray, suffix: str) -> list[str]:
     """Return the axes that may point up: a person is least deep from front to back, and x never points up."""
-    if suffix in (".glb", ".gltf"):
+    if suffix in _GLTF:
         return ["y"]  # as its specification says
     return {0: ["z", "y"], 1: ["z"], 2: ["y"]}[int(np.ptp(vertices, axis=0).argmin())]
 
