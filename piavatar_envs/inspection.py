@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import warnings
 from collections.abc import Mapping
@@ -73,7 +74,9 @@ def examine(path: Path, settings: Mapping[str, Any] | None = None, picture: Path
         report |= _joints(module, path, settings)
     report |= _body(asset)
     if hasattr(module, "read_character"):
-        report |= _surfaces(module.read_character(path, **settings))
+        read = inspect.signature(module.read_character).parameters
+        shared = {name: value for name, value in settings.items() if name in read}
+        report |= _surfaces(module.read_character(str(path), **shared))
     if gltf is not None and gltf.animations:
         report["animations"] = [f"{a.name or 'nameless'}: {a.end - a.start:.2f} s" for a in gltf.animations]
     if picture is not None:
@@ -180,6 +183,8 @@ def _body(asset: AvatarAsset) -> Report:
         "mass": f"{density * volume:.1f} kg at {density:g} kg/m^3",
         "skin": f"{len(asset.vertices)} vertices, {len(asset.faces)} triangles",
     }
+    if asset.skeleton is not None:
+        report["skeleton"] = f"{len(asset.skeleton.points)} points"
     if asset.shape_names:
         report["shape parameters"] = ", ".join(asset.shape_names)
     return report
