@@ -125,6 +125,7 @@ def build_matter(
     gravity: Sequence[float] = (0.0, 0.0, 0.0),
     pushed: bool = False,
     planes: Sequence[tuple[Sequence[float], float, float]] = (),
+    colliders: Sequence[Collider] = (),
     device: str = "cpu",
     **kwargs,
 ) -> Matter:
@@ -148,6 +149,7 @@ def build_matter(
         gravity: [m/s^2].
         pushed: whether :meth:`Matter.push` has an effect.
         planes: normal, offset [m] and friction [-] of each.
+        colliders: further solids.
         device: Warp device.
         **kwargs: for ``build_model``.
     """
@@ -157,7 +159,7 @@ def build_matter(
         volume = np.full(len(rest), spacing**3)
         points = MaterialPoints.uniform(volume, density, young_modulus, poisson_ratio, material, retardation)
     grid = make_grid(np.subtract(lower, margin), np.add(upper, margin), dx)
-    colliders = [Collider.plane(*plane) for plane in planes]
+    colliders = [*(Collider.plane(*plane) for plane in planes), *colliders]
     model = build_model(points, grid, device=device, gravity=gravity, colliders=colliders, **kwargs)
     state, scratch = allocate(model)
     keep = wp.full(1, 1.0, dtype=float, device=device)

@@ -17,6 +17,7 @@ capsule  about a segment of the z axis around the origin     radius, half length
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -112,6 +113,11 @@ class Collider:
             raise ValueError(f"friction={self.friction} of a {self.kind} must not be negative")
         if not np.linalg.norm(self.rotation) > 0.0:
             raise ValueError(f"rotation={list(self.rotation)} of a {self.kind} must be a quaternion wxyz, not zero")
+
+
+def half_thickness(kind: str, size: Sequence[float]) -> float:
+    """Return half the thickness of a collider across its thinnest part [m]; infinity for a plane."""
+    return {"plane": math.inf, "box": min(size, default=0.0)}.get(kind, size[0] if size else 0.0)
 
 
 def make_boundaries(colliders: Sequence[Collider], num_fields: int, rows: int, device: str) -> Boundaries:
@@ -260,6 +266,15 @@ def remove_approach(boundaries: Boundaries, e: int, x: wp.vec3, v: wp.vec3, gate
     return v
 
 
+@wp.func
+def turned(rotation: wp.quat, spin: wp.vec3, dt: float):
+    """Return a rotation after ``dt`` [s] of spin [rad/s]; without spin it keeps its bits."""
+    rate = wp.length(spin)
+    if rate > 0.0:
+        return wp.normalize(wp.quat_from_axis_angle(spin / rate, rate * dt) * rotation)
+    return rotation
+
+
 @wp.kernel
 def move_colliders(dt: float, boundaries: Boundaries):
     """Advance every collider by its velocity and spin for ``dt`` [s], over ``(rows, B)``.
@@ -268,11 +283,7 @@ def move_colliders(dt: float, boundaries: Boundaries):
     """
     r, b = wp.tid()
     boundaries.position[r, b] = boundaries.position[r, b] + dt * boundaries.velocity[r, b]
-    spin = boundaries.spin[r, b]
-    rate = wp.length(spin)
-    if rate > 0.0:
-        turn = wp.quat_from_axis_angle(spin / rate, rate * dt)
-        boundaries.rotation[r, b] = wp.normalize(turn * boundaries.rotation[r, b])
+    boundaries.rotation[r, b] = turned(boundaries.rotation[r, b], boundaries.spin[r, b], dt)
 
 
 @wp.kernel

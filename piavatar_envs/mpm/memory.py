@@ -156,6 +156,7 @@ def allocate(model: Model) -> tuple[State, Scratch]:
         sensors=allocate_sensors(model, shared),
         arena=arena,
         large_arena=large_arena,
+        positions=None if model.thin_colliders is None else _zeros(model, particles, wp.vec3),
     )
     return state, scratch
 

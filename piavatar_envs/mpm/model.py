@@ -15,6 +15,7 @@ from piavatar_envs.mpm.cuda.block_grid import MOST_LISTED, MOST_PARTICLES, large
 from piavatar_envs.mpm.cuda.tiled_p2g import plan_tiles
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.memory import bound_active_blocks, check_memory, choose_activation_interval
+from piavatar_envs.mpm.thin_colliders import thin_colliders
 from piavatar_envs.mpm.types import (
     CFL_STABLE,
     DECOUPLING,
@@ -338,6 +339,7 @@ def build_model(
     max_active_blocks = bound_active_blocks(max_active_blocks, points.fields, grid, fields.num_fields)
     path = choose_path(path, device, points.fields, max_active_blocks, decoupling)
     check_memory(num_envs, points.num_particles, max_active_blocks, device, fields.num_fields, grid.num_blocks, path)
+    thin = thin_colliders(colliders, grid.dx)
     step = Step()
     step.dt = control_dt / num_substeps
     step.gravity = wp.vec3(*gravity)
@@ -359,6 +361,7 @@ def build_model(
         max_active_blocks=max_active_blocks,
         activation_interval=choose_activation_interval(path, points.fields),
         path=path,
+        thin_colliders=wp.array(thin, dtype=int, device=device) if thin else None,
     )
 
 

@@ -2,7 +2,8 @@
 
 The split-velocity scheme of PIAvatar (Han et al., arXiv 2606.21162) with APIC transfers (Jiang et al., 2015) on
 quadratic B-splines: particles carry a physical velocity ``u`` and a kinematic velocity ``vk``; contact acts on the
-nodes' total velocity.
+nodes' total velocity. Where a collider is thin, a fifth stage stops particles at it
+(:mod:`piavatar_envs.mpm.thin_colliders`).
 
 ``model.path`` names the path of P2G and G2P. ``"plain"`` runs on CPUs, and on GPUs below compute capability 7.0.
 ``"tiled"`` sums tiles of particles of large bodies in shared memory before they reach the grid. ``"block"`` keeps the
@@ -44,6 +45,7 @@ from piavatar_envs.mpm.sparse_grid import (
     reset_contact_nodes,
     tracks_contact_nodes,
 )
+from piavatar_envs.mpm.thin_colliders import stop_at_thin_colliders, store_positions
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State
 
 
@@ -56,12 +58,22 @@ def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scra
     simulated = (model, state, scratch)
     if index > 0 and index % model.activation_interval == 0:
         record_activation(graph, *simulated)
+    if model.thin_colliders is not None:
+        graph.launch(store_positions, state.x.shape, [state.x], [scratch.positions])
     if model.path == "block":
         record_block_substep(graph, *simulated, first=index == 0)
     else:
         record_p2g(graph, *simulated)
         record_grid_update(graph, *simulated)
         record_g2p(graph, *simulated)
+    if model.thin_colliders is not None:
+        m = model
+        graph.launch(
+            stop_at_thin_colliders,
+            state.x.shape,
+            [m.grid, m.step, m.particles, m.boundaries, m.contact, m.thin_colliders, scratch.positions],
+            [scratch.blocks, _moving(state), state.failure, scratch.sensors],
+        )
     if model.moving_boundaries:
         graph.launch(move_colliders, model.boundaries.position.shape, [model.step.dt], [model.boundaries])
 

@@ -255,6 +255,7 @@ class Model:
         max_active_blocks: most active blocks of an environment, over all fields.
         activation_interval: substeps between activations of blocks.
         path: path of P2G and G2P, one of :data:`PATHS`.
+        thin_colliders: indices of the colliders of :mod:`piavatar_envs.mpm.thin_colliders`; None without any.
     """
 
     num_envs: int
@@ -273,6 +274,7 @@ class Model:
     max_active_blocks: int
     activation_interval: int
     path: str
+    thin_colliders: wp.array | None = None
 
     @property
     def num_blocks(self) -> int:
@@ -322,6 +324,7 @@ class Scratch:
         sensors: contact sensors.
         arena: shared memory of the block-per-environment path.
         large_arena: whether an arena takes a multiprocessor of its own.
+        positions: of the particles before G2P [m]; None unless colliders are thin.
     """
 
     blocks: Blocks
@@ -331,3 +334,4 @@ class Scratch:
     sensors: Sensors
     arena: Arena
     large_arena: bool
+    positions: wp.array | None
