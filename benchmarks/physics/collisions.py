@@ -20,7 +20,7 @@ from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import Fields, MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.sim import prop_geometry as geometry
-from piavatar_envs.sim.world import GRID_PER_HEIGHT
+from piavatar_envs.sim.resolution import GRID_PER_HEIGHT
 
 #: Half the edge of a block [m].
 BLOCK = (0.2, 0.2, 0.1)

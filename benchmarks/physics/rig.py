@@ -25,7 +25,8 @@ from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.sim.bodies import pose_control
-from piavatar_envs.sim.world import GRID_PER_HEIGHT, record_control_step
+from piavatar_envs.sim.resolution import GRID_PER_HEIGHT
+from piavatar_envs.sim.world import record_control_step
 from piavatar_envs.tasks.track_motion import apply_impulse
 
 DENSITY = 1000.0

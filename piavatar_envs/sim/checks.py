@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 from piavatar_envs.config import AvatarConfig, ColliderConfig, ConfigError, PropConfig, SceneConfig
-from piavatar_envs.mpm.colliders import COLLIDER_KINDS
+from piavatar_envs.mpm.colliders import COLLIDER_KINDS, half_thickness
 from piavatar_envs.sim.bodies import Flesh
 from piavatar_envs.sim.prop_geometry import PropPoints, primitive_distance
 from piavatar_envs.sim.props import turn_of
@@ -36,6 +36,8 @@ _FIRM = [
 WITHIN = 0.4
 #: Greatest number of points along half of a box's edge.
 MOST_POINTS = 20
+#: Points of a way at which the distance from a collider is evaluated, and the error of where it ends [m].
+TRACES, WAY_ERROR = 40, 1.0e-3
 #: Longest move that a message suggests [m].
 _FARTHEST_MOVE = 3.0
 
@@ -135,12 +137,16 @@ def check_beside_solids(
         thing = _prop(prop, rest)
         matter = np.vstack([thing.inner, thing.middle])
         for solid in solids:
-            deep = -solid.distance(matter)
+            # a mesh may be a ring around a pole
+            depths = _depths_through if solid.thickness < 2.0 * dx and prop.shape != "mesh" else _depths
+            deep = depths(solid, matter)
             # its centre, or more than the depth of contact
             if deep[-1] > 0.0 or deep.max() > dx:
                 ways = _ways(solid, thing.middle, thing.lift, dx)
                 move = _shortest(
-                    ways, lambda by, solid=solid, matter=matter: solid.distance(matter + by).min() >= 0, dx
+                    ways,
+                    lambda by, depths=depths, solid=solid, matter=matter: depths(solid, matter + by).max() <= 0.0,
+                    dx,
                 )
                 _refuse(thing.name, deep.max(), solid.name, dx, move)
 
@@ -192,6 +198,7 @@ class _Thing:
         distance: signed distance of points from its surface, negative inside, ``(N, 3)`` to ``(N,)`` [m].
         inner: points within it, ``(N, 3)`` [m]; empty for a plane.
         lift: vertical direction in which messages suggest to move it: 1 for props, -1 for colliders.
+        thickness: of a collider at its thinnest [m].
     """
 
     name: str
@@ -199,6 +206,7 @@ class _Thing:
     distance: Callable[[np.ndarray], np.ndarray]
     inner: np.ndarray
     lift: float
+    thickness: float = math.inf
 
     @property
     def bounded(self) -> bool:
@@ -224,7 +232,8 @@ def _collider(collider: ColliderConfig, dx: float) -> _Thing:
         axes = [np.linspace(-end, end, 1 + 2 * min(math.ceil(end / dx), MOST_POINTS)) for end in ends[collider.kind]]
         inner = middle + turn.apply(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3))
     name = GROUND if collider.name == GROUND else f"collider {collider.name!r}"
-    return _Thing(name, middle, _distance(collider.kind, collider, turn), inner, -1.0)
+    thickness = 2.0 * half_thickness(collider.kind, collider.size)
+    return _Thing(name, middle, _distance(collider.kind, collider, turn), inner, -1.0, thickness)
 
 
 def _prop(prop: PropConfig, rest: PropPoints) -> _Thing:
@@ -232,6 +241,27 @@ def _prop(prop: PropConfig, rest: PropPoints) -> _Thing:
     turn, middle = turn_of(prop), np.array(prop.position)
     inner = middle + turn.apply(rest.rest)
     return _Thing(f"prop {prop.name!r}", middle, _distance(prop.shape, prop, turn), inner, 1.0)
+
+
+def _depths(solid: _Thing, matter: np.ndarray) -> np.ndarray:
+    """Return the depths of points in a collider [m], shape ``(N,)``, negative outside."""
+    return -solid.distance(matter)
+
+
+def _depths_through(solid: _Thing, matter: np.ndarray) -> np.ndarray:
+    """Return :func:`_depths`, or the length of the way from the last point [m] that is in or behind the collider.
+
+    The collider is thin: matter that is beyond it is not in it. The way enters where sphere tracing ends, as in
+    :mod:`piavatar_envs.mpm.thin_colliders`.
+    """
+    way = matter - matter[-1]
+    length = np.maximum(np.linalg.norm(way, axis=1), 1.0e-9)
+    share = np.zeros(len(matter))
+    for _ in range(TRACES):
+        share += np.maximum(solid.distance(matter[-1] + share[:, None] * way), 0.0) / length
+        share = np.minimum(share, 1.0)
+    behind = (1.0 - share) * length
+    return np.where(behind > WAY_ERROR, behind, _depths(solid, matter))
 
 
 @dataclass(frozen=True)

@@ -31,17 +31,10 @@ from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_pla
 from piavatar_envs.sim.forces import Forces, Receivers
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
 from piavatar_envs.sim.randomize import Randomization, fastest_wave, limiting_wave
+from piavatar_envs.sim.resolution import GRID_PER_HEIGHT, check_sizes
 from piavatar_envs.sim.scene import Domain, assemble
 from piavatar_envs.sim.shapes import Shapes, check_shape_names
 from piavatar_envs.sim.time_step import choose_substeps
-
-#: Grid spacings in a standing mean body, by fidelity; "fine" is the paper's scale, about 1 cm.
-GRID_PER_HEIGHT: dict[str, float] = {
-    "tiny": 12.0,
-    "coarse": 32.0,
-    "medium": 64.0,
-    "fine": 166.0,
-}
 
 
 class Simulation:
@@ -163,6 +156,8 @@ class Simulation:
         differs = bool(self._solids) or any(flesh.shape.randomize for flesh in self.flesh)
         rows = self.num_envs if differs else 1
         self.subjects = assemble(self.scene, self.config.physics, names, self.flesh, self._prop_matter, walls, rows)
+        props = zip(self.scene.props, self._solids, strict=True)
+        check_sizes(self.dx, self.config.physics.fidelity, self.scene.colliders, props)
 
     def _build_model(self, largest_impulses: Mapping[str, float]) -> None:
         """Choose the time step and upload the constants of the continuum."""

@@ -100,6 +100,17 @@ def test_how_things_lie_is_seen(device, scene, instead):
     build(device, fidelity="coarse", **scene | instead)
 
 
+def test_matter_behind_a_thin_plate_is_seen(device):
+    # A third of the ball begins beyond the plate, none of it deep inside.
+    plate = {"name": "plate", "kind": "box", "size": [0.4, 0.01, 0.4], "position": [0.0, -1.0, 1.0]}
+    scene = {"colliders": [plate], "props": [BALL | {"size": [0.2], "position": [0.0, -1.06, 1.0]}]}
+    with pytest.raises(ConfigError, match=r"inside collider 'plate'; .* move it by ") as refused:
+        build(device, fidelity="coarse", **scene)
+    move, *way = map(float, re.search(r"by (\S+) m along \[(.*), (.*), (.*)\]", str(refused.value)).groups())
+    scene["props"][0]["position"] = list(np.array([0.0, -1.06, 1.0]) + move * np.array(way))
+    build(device, fidelity="coarse", **scene)
+
+
 def test_meshes_are_looked_at(device, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     path = tmp_path / "cube.obj"

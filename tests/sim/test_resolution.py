@@ -1,0 +1,96 @@
+"""Sizes that a grid cannot hold are refused, with a size and a resolution that can."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+from piavatar_envs.config import ColliderConfig, ConfigError, PropConfig
+from piavatar_envs.sim.prop_geometry import PropPoints, box, capsule, sphere
+from piavatar_envs.sim.resolution import GRID_PER_HEIGHT, check_sizes
+
+HEIGHT = 1.66
+#: Kind of a collider, and its size from a thickness; the limits in grid spacings.
+POLES = {
+    "capsule": lambda t: ("capsule", (t / 2, 0.5)),
+    "rod": lambda t: ("box", (t / 2, 0.5, t / 2)),
+}
+BALLS = {
+    "sphere": lambda t: ("sphere", (t / 2,)),
+    "capsule": lambda t: ("capsule", (0.4 * t, 0.1 * t)),
+    "cube": lambda t: ("box", (t / 2, t / 2, t / 2)),
+}
+COLLIDERS = {f"pole: {name}": (make, 0.57) for name, make in POLES.items()}
+COLLIDERS |= {f"ball: {name}": (make, 1.2) for name, make in BALLS.items()}
+PROPS = {
+    "sphere": lambda t: sphere(t / 2, 0.02),
+    "box": lambda t: box((0.3, t / 2, 0.2), 0.02),
+    "capsule": lambda t: capsule(t / 2, 0.2, 0.02),
+}
+
+
+def check(fidelity, collider=None, points: PropPoints | None = None):
+    colliders = [] if collider is None else [ColliderConfig(name="own", kind=collider[0], size=collider[1])]
+    props = [] if points is None else [(PropConfig(name="own"), points)]
+    check_sizes(HEIGHT / GRID_PER_HEIGHT[fidelity], fidelity, colliders, props)
+
+
+def remedies(error) -> tuple[float, str]:
+    """Return the thickness [m] and the resolution that a message suggests."""
+    thickness, fidelity = re.search(r"make it (\S+) m thick, or set fidelity='(\w+)'", str(error)).groups()
+    return float(thickness), fidelity
+
+
+@pytest.mark.parametrize(("make", "cells"), COLLIDERS.values(), ids=COLLIDERS)
+@pytest.mark.parametrize("fidelity", ["tiny", "coarse", "medium"])
+def test_small_colliders_are_refused_and_both_remedies_help(make, cells, fidelity):
+    thickness = 0.95 * cells * HEIGHT / GRID_PER_HEIGHT[fidelity]
+    with pytest.raises(ConfigError, match=r"collider 'own' is \S+ m thick") as refused:
+        check(fidelity, make(thickness))
+    larger, finer = remedies(refused.value)
+    with pytest.warns(UserWarning, match="may be cut"):
+        check(fidelity, make(larger))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check(finer, make(thickness))
+
+
+@pytest.mark.parametrize("make", PROPS.values(), ids=PROPS)
+@pytest.mark.parametrize("fidelity", ["tiny", "coarse", "medium"])
+def test_small_props_are_refused_and_both_remedies_help(make, fidelity):
+    thickness = 0.45 * HEIGHT / GRID_PER_HEIGHT[fidelity]
+    with pytest.raises(ConfigError, match=r"prop 'own' is \S+ m thick") as refused:
+        check(fidelity, points=make(thickness))
+    larger, finer = remedies(refused.value)
+    check(fidelity, points=make(larger))
+    check(finer, points=make(thickness))
+
+
+def test_no_resolution_is_suggested_where_none_helps():
+    for refused in ({"points": sphere(1e-6, 0.02)}, {"collider": ("sphere", (1e-6,))}):
+        with pytest.raises(ConfigError, match=r"make it .* m thick$"):
+            check("coarse", **refused)
+
+
+def test_colliders_that_may_cut_are_accepted_with_a_warning():
+    with pytest.warns(UserWarning, match=r"strike its edge .* set fidelity='medium'"):
+        check("coarse", ("box", (0.01, 0.5, 0.5)))
+    for pole in (("capsule", (0.025, 0.5)), ("sphere", (0.05,))):
+        with pytest.warns(UserWarning, match=r"strike it at .* set fidelity='medium'"):
+            check("coarse", pole)
+
+
+def test_what_is_large_enough_is_accepted_silently():
+    dx = HEIGHT / GRID_PER_HEIGHT["coarse"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for make in POLES.values():
+            check("coarse", make(1.21 * dx))
+        for make in BALLS.values():
+            check("coarse", make(2.41 * dx))
+        for size in np.eye(3)[:, [1, 0, 2]] * (0.31 * dx - 0.5) + 0.5:
+            check("coarse", ("box", tuple(size)))
+        check("coarse", ("plane", ()))
