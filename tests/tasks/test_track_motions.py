@@ -7,19 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.motion import Motion, load_motion
+from piavatar_envs.avatar.motion import Motion, collection, load_motion
 from piavatar_envs.avatar.motion.collection import (
     Entry,
     Sampling,
     chosen,
     find_motions,
     load_all,
+    load_frames,
     place_in_split,
     sample_frames,
 )
 from piavatar_envs.config import ConfigError
+from piavatar_envs.core import result_cache
 from tests.avatar.skeletons import Skeleton, write_bvh
 from tests.tasks.measured import still
 
@@ -150,3 +153,33 @@ def test_a_state_knows_the_files_of_its_folder(make_env, folder, tmp_path):
     other.reset(seed=0)
     with pytest.raises(ValueError, match="motion"):
         other.set_state(state)
+
+
+def test_what_took_long_to_read_is_kept_until_a_file_changes(monkeypatch, folder, tmp_path):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
+    monkeypatch.setattr(result_cache, "LEAST_SECONDS", 0.0)
+    own = tmp_path / "own"
+    shutil.copytree(folder, own)
+    loaded: list[str] = []
+
+    def counted(place, *args, **kwargs):
+        loaded.append(Path(place).name)
+        return load_motion(place, *args, **kwargs)
+
+    monkeypatch.setattr(collection, "load_motion", counted)
+    asset = load_asset()
+    shape = np.zeros(len(asset.shape_names))
+
+    def load(loop: bool = False):
+        with pytest.warns(UserWarning, match="1 of 3 files are left out"):
+            return load_frames(find_motions(f"{own}/"), asset, shape, None, loop, Sampling(DT, 30, True))
+
+    first, again = load(), load()
+    assert loaded == ["long.bvh", "shape.npz", "short.bvh"] and first.names == again.names
+    for name in ("rotations", "roots", "first", "starts"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    load(loop=True)
+    assert len(loaded) == 6
+    text = (own / "short.bvh").read_text()
+    (own / "short.bvh").write_text(text.replace("Frame Time: 0.0333333", "Frame Time: 0.0400000"))
+    assert load().first[-1] > first.first[-1] and len(loaded) == 9

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,11 +15,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from piavatar_envs.avatar.motion.library import SUFFIXES, clips_of, load_motion
 from piavatar_envs.avatar.motion.motion import Motion
+from piavatar_envs.core.result_cache import digest_of, kept
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from piavatar_envs.avatar.body.asset import AvatarAsset
 
 Split = Literal["all", "train", "held_out"]
+_READERS = "amass bvh collection deepmimic gltf_animations ground library motion recording retarget".split()
 _SHOWN = 3  # files that a warning names
 
 
@@ -195,7 +199,7 @@ def load_frames(
     loop: bool,
     sampling: Sampling,
 ) -> Frames:
-    """Load motions for a body and sample them; the same files are read once for all environments of a process.
+    """Load motions for a body and sample them; what takes long is kept until a file changes.
 
     Args:
         entries: places of the motions.
@@ -208,26 +212,36 @@ def load_frames(
     Raises:
         ValueError, FileNotFoundError: see :func:`load_all`.
     """
-    files = [Path(place) for entry in entries for place in (entry.place, entry.place.rpartition("#")[0]) if place]
-    stamps = tuple((str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
-    names = None if mapping is None else tuple(sorted(mapping.items()))
-    shape = tuple(np.asarray(parameters, dtype=float).tolist())
-    # a clip that is no file may be registered anew under its name
-    load = _load_frames if len(stamps) == len(entries) else _load_frames.__wrapped__
-    return load(tuple(entries), stamps, asset, shape, names, loop, sampling)
+    body = asset.shape(parameters)
+
+    def compute() -> dict[str, np.ndarray]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            loaded = load_all(entries, lambda place: load_motion(place, asset, body, mapping=mapping, loop=loop))
+        texts = [str(warning.message) for warning in caught]
+        return {**vars(sample_frames(*loaded, sampling)), "warned": np.array(texts, dtype=str)}
+
+    files = [_file_of(entry.place) for entry in entries]
+    if None in files:
+        arrays = compute()  # a clip by name may be registered anew, a .gltf has files beside it
+    else:
+        contents = [hashlib.blake2b(file.read_bytes()).hexdigest() for file in files]
+        skin = [body.vertices, body.joints, asset.skin_joints, asset.skin_weights]
+        names = sorted((mapping or {}).items())
+        digest = digest_of([list(entries), contents, skin, names, loop, sampling], _code())
+        arrays = kept("motions", digest, compute, f"reading {len(entries)} motions")
+    for text in arrays.pop("warned").tolist():
+        warnings.warn(text, stacklevel=3)
+    return Frames(**{**arrays, "names": tuple(np.asarray(arrays["names"]).tolist())})
 
 
-@lru_cache(maxsize=2)
-def _load_frames(
-    entries: tuple[Entry, ...],
-    stamps: tuple[tuple[str, int, int], ...],
-    asset: AvatarAsset,
-    parameters: tuple[float, ...],
-    mapping: tuple[tuple[str, str], ...] | None,
-    loop: bool,
-    sampling: Sampling,
-) -> Frames:
-    body = asset.shape(np.array(parameters))
-    names = None if mapping is None else dict(mapping)
-    loaded = load_all(entries, lambda place: load_motion(place, asset, body, mapping=names, loop=loop))
-    return sample_frames(*loaded, sampling)
+def _file_of(place: str) -> Path | None:
+    """Return the file that a motion, or the animation of a file, is in; None if it is in none, or in several."""
+    paths = (Path(text) for text in (place, place.rpartition("#")[0]) if text)
+    return next((path for path in paths if path.is_file() and path.suffix.lower() != ".gltf"), None)
+
+
+def _code() -> list[ModuleType]:
+    """Return the modules that read and retarget motions."""
+    names = ("gltf", "gltf_surfaces", "body.rigs", "body.skeleton", *(f"motion.{name}" for name in _READERS))
+    return [importlib.import_module(f"piavatar_envs.avatar.{name}") for name in names]
