@@ -35,15 +35,14 @@ _SHAPES = {
 _WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 #: Extensions that files may require, because they change nothing that is read or are read here.
 _READ = frozenset(
-    "KHR_mesh_quantization KHR_texture_transform KHR_texture_basisu EXT_texture_webp KHR_lights_punctual "
-    "KHR_materials_pbrSpecularGlossiness VRM VRMC_vrm VRMC_springBone VRMC_node_constraint VRMC_materials_mtoon "
+    "KHR_mesh_quantization KHR_texture_transform KHR_texture_basisu EXT_texture_webp EXT_texture_avif "
+    "KHR_lights_punctual MSFT_texture_dds VRM VRMC_vrm VRMC_springBone VRMC_node_constraint VRMC_materials_mtoon "
     "VRMC_materials_hdr_emissiveMultiplier KHR_animation_pointer KHR_xmp_json_ld".split()
 )
 _COMPRESSED = {
     "EXT_meshopt_compression": "undo the compression with: npx @gltf-transform/cli copy IN.glb OUT.glb",
     "KHR_meshopt_compression": "undo the compression with: npx @gltf-transform/cli copy IN.glb OUT.glb",
     "KHR_draco_mesh_compression": "undo the compression with: npx @gltf-transform/cli copy IN.glb OUT.glb",
-    "EXT_mesh_gpu_instancing": "expand the instances with: npx @gltf-transform/cli uninstance IN.glb OUT.glb",
 }
 _FOREIGN = (
     (b"Kaydara FBX", ".fbx", "FBX", "Blender's File > Import > FBX and File > Export > glTF 2.0, or FBX2glTF"),

@@ -154,6 +154,43 @@ def test_an_unreadable_texture_is_a_note(file):
     assert (surfaces.pieces[0].colors == 255).all() and "texture 0 is left out" in surfaces.notes[0]
 
 
+def test_a_skin_without_a_bind_pose_is_read_as_shown(file):
+    """Vertices are then in the spaces of their bones, which have no pose of their own."""
+    out = Writer()
+    out.document["nodes"] = [{"children": [1]}, {"translation": [1.0, 2.0, 3.0]}]
+    bones = out.accessor(np.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8), "VEC4")
+    shares = np.array([[128, 128, 0, 0], [255, 0, 0, 0], [0, 0, 0, 0]], np.uint8)  # the last has none
+    weights = out.accessor(shares, "VEC4", normalized=True)
+    triangle(out, JOINTS_0=bones, WEIGHTS_0=weights)
+    out.add("skins", {"joints": [0, 1]})
+    out.document["nodes"][-1]["skin"] = 0
+    surfaces = read_surfaces(read_gltf(out.save(file)))
+    np.testing.assert_allclose(surfaces.places[0], [[1.5, 1.0, 1.5], [1.0, 3.0, 3.0], [0.0, 0.0, 1.0]])
+    assert "do not agree" in surfaces.notes[-1] and "1 vertices" in surfaces.notes[0]
+
+
+def test_skins_that_share_bones_agree_on_the_bind_pose(file):
+    """The mesh of either skin is in a space of its own, from which its inverse bind matrices lead."""
+    out = Writer()
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
+    out.document["nodes"] = [{"children": [1]}, {"translation": [0.0, 1.0, 0.0], "rotation": [0, 0, 0.6, 0.8]}]
+    weights = out.accessor(np.tile(np.float32([1, 0, 0, 0]), (3, 1)), "VEC4")
+    bones = out.accessor(np.zeros((3, 4), np.uint8), "VEC4")
+    upper = np.eye(4)
+    upper[1, 3] = -1.0  # bound without the turn that is shown
+    for own in (np.eye(4), turn):
+        binds = np.stack([np.eye(4), upper]) @ own
+        matrices = out.accessor(binds.transpose(0, 2, 1).reshape(2, 16).astype("<f4"), "MAT4")
+        out.add("skins", {"joints": [0, 1], "inverseBindMatrices": matrices})
+        triangle(out, JOINTS_0=bones, WEIGHTS_0=weights)
+        out.document["nodes"][-1]["skin"] = len(out.document["skins"]) - 1
+    surfaces = read_surfaces(read_gltf(out.save(file)))
+    np.testing.assert_allclose(surfaces.places[0], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(surfaces.places[1], turn[:3, :3].T, atol=1e-6)
+    np.testing.assert_allclose(surfaces.world[1], np.linalg.inv(upper), atol=1e-6)
+
+
 def test_strips_and_fans_are_triangles(file):
     out = Writer()
     points = out.accessor(np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32), "VEC3")
