@@ -11,7 +11,8 @@ bound, the joint is held along ``n``: an inertia ``mu n n^T``, :data:`HOLD` time
 to the matrix, and ``mu n`` times the allowed change to the right-hand side. The system is factorized and solved again,
 so that all joints respond to all stops at once, and a blow on a limb reaches the trunk in the same substep. A stop that
 pulls is released, and the next solution is computed without it (an active-set method; Nocedal & Wright, "Numerical
-Optimization", 2006, ch. 16.5).
+Optimization", 2006, ch. 16.5). The first solutions may hold and release a joint alternately; later ones leave it loose
+once it is released, so that they come to an end.
 
 Stops act between a bone and its parent, do not rebound, and keep momentum.
 """
@@ -37,7 +38,7 @@ _TOLERANCE = wp.constant(1.0e-3)
 _BACK_SHARE, _BACK_SPEED = wp.constant(0.2), wp.constant(2.0)
 #: Bounds of a joint: its three components, and the angle. Each has two bits of its joint's number in ``held``.
 _BOUNDS = wp.constant(4)
-_UPPER, _LOWER = wp.constant(1), wp.constant(2)
+_UPPER, _LOWER, _LOOSE = wp.constant(1), wp.constant(2), wp.constant(3)
 _FAR = wp.constant(1.0e6)
 
 
@@ -45,7 +46,7 @@ _FAR = wp.constant(1.0e6)
 class Stops:
     """Stops that hold joints in the solution at hand; ``(num_envs, bones)``."""
 
-    held: wp.array2d(dtype=int)  # two bits a bound: which of its two ends holds the joint
+    held: wp.array2d(dtype=int)  # two bits a bound: which of its two ends holds the joint, or that it is loose
     inertia: wp.array2d(dtype=wp.mat33)  # added to the joint's block of the matrix [kg m^2]
     impulse: wp.array2d(dtype=wp.vec3)  # added to the right-hand side [N m s]
 
@@ -60,16 +61,18 @@ def allowed_rate(way: float, per_time: float):
 
 
 @wp.func
-def end_that_holds(rate: float, high: float, low: float, before: int):
+def end_that_holds(rate: float, high: float, low: float, before: int, final: bool):
     """Return the end that holds a joint turning at ``rate``, allowed from ``low`` to ``high`` [rad/s]; 0 for none.
 
     ``before`` held it in the solution that has the rate. Held by an end, it exceeds the allowed rate a little; where it
-    does not, the end pulls.
+    does not, the end pulls. A joint that a ``final`` solution releases stays loose.
     """
     if before == _UPPER and rate >= high:
         return _UPPER
     if before == _LOWER and rate <= low:
         return _LOWER
+    if before == _LOOSE or (before != 0 and final):
+        return _LOOSE
     if before == 0 and rate > high + _TOLERANCE:
         return _UPPER
     if before == 0 and rate < low - _TOLERANCE:
@@ -97,6 +100,7 @@ def hold_joint(
     outside: wp.array2d(dtype=float),
     change: wp.array2d(dtype=float),
     row_of_change: int,
+    final: bool,
     e: int,
     b: int,
     # in and out
@@ -130,9 +134,9 @@ def hold_joint(
         elif angle > 0.5 * MAX_ANGLE:
             axis = v / angle
         high = allowed_rate(high, per_time)
-        end = end_that_holds(wp.dot(axis, after), high, low, (old >> (2 * i)) & 3)
-        if end != 0:
-            held = held | (end << (2 * i))
+        end = end_that_holds(wp.dot(axis, after), high, low, (old >> (2 * i)) & 3, final)
+        held = held | (end << (2 * i))
+        if end != 0 and end != _LOOSE:
             block += wp.outer(axis, axis)
             impulse += (wp.where(end == _UPPER, high, low) - wp.dot(axis, before)) * axis
     block = (HOLD * inertia) * (A * block * wp.transpose(A))

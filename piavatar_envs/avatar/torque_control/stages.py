@@ -81,6 +81,8 @@ MASS_BLOCK = wp.constant(128)
 _ARENA_WORDS = wp.constant(ARENA_WORDS)
 #: Most repeated solutions in a substep: a muscle at its limit changes the load of the others.
 MOST_CUTS = wp.constant(8)
+#: Repeated solutions in which a joint may be held again after it was released.
+_FREE_CUTS = wp.constant(2)
 #: Share of the deviation between pose and particles that one fit removes. Particles of fast, light joints (head, hands)
 #: also deviate for other reasons, so that following them at once would destabilise these joints.
 FIT_SHARE = 0.2
@@ -184,7 +186,7 @@ def limit_joints(
     strength: Strength,
     driven: int,
     own: int,
-    again: bool,
+    cuts: int,
     e: int,
     thread: int,
     threads: int,
@@ -192,19 +194,21 @@ def limit_joints(
 ) -> float:
     """Limit the impulses of the muscles at share ``own``, and hold joints at the ends of their ranges.
 
-    Returns to all threads the number of joints for which either has changed. With ``again``, muscles already limited
-    are skipped.
+    Returns to all threads the number of joints for which either has changed. After the first of the repeated
+    solutions, ``cuts``, muscles already limited are skipped.
     """
     changed = float(0.0)
+    final = cuts >= _FREE_CUTS
     for k in range(thread, TRIPLES, threads):
         rest = w.diagonals[driven, 3 * k]
         changed += limit_torque(
-            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, again, e, k, w.impulse, w.left
+            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, cuts > 0, e, k, w.impulse, w.left
         )  # fmt: skip
         if k > 1 and tissue.lock[wp.max(k - 1, 0)] == 0.0:
             inertia = joint_inertia(w.pattern, w.matrix, w.left[e, 3 * k], e, k)
             changed += hold_joint(
-                body, dt, w.pose, tissue, inertia, w.velocity, w.outside, w.shares, own, e, k - 1, w.stops, w.impulse
+                body, dt, w.pose, tissue, inertia, w.velocity, w.outside, w.shares, own, final, e, k - 1, w.stops,
+                w.impulse,
             )  # fmt: skip
     sync_threads(threads)
     return sum_threads(changed, threads)
@@ -270,7 +274,7 @@ def apply_torques(
         contact = stop_bones(body, ground, dt, own, factor, e, thread, threads, arena, w)
         if cuts == MOST_CUTS:
             break
-        if limit_joints(body, dt, springs, tissue, strength, driven, own, cuts > 0, e, thread, threads, w) == 0.0:
+        if limit_joints(body, dt, springs, tissue, strength, driven, own, cuts, e, thread, threads, w) == 0.0:
             break
         cuts += 1
         factor = w.factors.shape[0] - 1
