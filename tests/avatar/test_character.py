@@ -66,7 +66,8 @@ def test_the_body_of_a_closed_character_is_its_own_surface(character):
     assert len(sample_particles(body, 0.05)) == pytest.approx(len(sample_particles(asset, 0.05)), rel=0.03)
 
 
-def test_worn_surfaces_are_drawn_from_both_sides_and_are_no_body(character):
+def dressed_in_a_tube(character: Character) -> tuple[Character, int]:
+    """Return the character in a skirt, an open tube about the hips that is blue, and its number of triangles."""
     low, high = 0.7, 1.1  # a skirt: an open tube about the hips [m]
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     rings = [np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle), np.full(24, z)], -1) for z in (low, high)]
@@ -84,13 +85,33 @@ def test_worn_surfaces_are_drawn_from_both_sides_and_are_no_body(character):
         colors=np.concatenate([character.colors, np.tile(np.array([[20, 30, 200]], np.uint8), (48, 1))]),
         shape_deltas=np.concatenate([character.shape_deltas, zeros], axis=2),
     )
+    return dressed, len(tube)
+
+
+def test_worn_surfaces_are_drawn_from_both_sides_and_are_no_body(character):
+    dressed, tube = dressed_in_a_tube(character)
     bare, body = body_of(character), body_of(dressed)
     assert np.array_equal(body.vertices, bare.vertices) and np.array_equal(body.faces, bare.faces)
-    assert len(body.look.faces) == len(bare.look.faces) + 2 * len(tube)
+    assert len(body.look.faces) == len(bare.look.faces) + 2 * tube
     blue = (body.look.colors == (20, 30, 200)).all(axis=1)
     assert blue.sum() == 2 * 48  # an own vertex for either side, so that both have normals
     sides = body.look.faces[blue[body.look.faces].all(axis=1)]
     assert abs(mesh_volume(body.look.vertices, sides)) < 1e-9
+
+
+def test_a_look_of_too_many_triangles_is_drawn_with_fewer(character, monkeypatch):
+    dressed, _ = dressed_in_a_tube(character)
+    whole = body_of(dressed).look
+    monkeypatch.setattr("piavatar_envs.avatar.body.character.MOST_DRAWN", 4000)
+    body = body_of(dressed)
+    look, bare = body.look, body_of(character).look
+    assert len(look.faces) < 8000 < len(whole.faces)
+    assert cKDTree(whole.vertices).query(look.vertices)[0].max() == 0.0
+    assert cKDTree(look.vertices).query(whole.vertices)[0].max() < 0.06
+    assert np.abs(mesh_volume(bare.vertices, bare.faces) / body.volume([0.0, 0.0]) - 1.0) < 0.02
+    # no triangle joins the skirt to the body
+    blue = (look.colors == (20, 30, 200)).all(axis=1)[look.faces]
+    assert (blue.all(axis=1) | ~blue.any(axis=1)).all() and blue.any()
 
 
 def test_joints_without_flesh_take_a_share_of_their_parents(character):

@@ -256,7 +256,10 @@ def _coarser(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple
     corners = vertices[faces]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     used = np.unique(faces)
-    _, cell = unique_rows(np.floor(vertices[used] / np.sqrt(2.0 * area / MOST_DRAWN)).astype(np.int64))
+    place = np.floor(vertices[used] / np.sqrt(2.0 * area / MOST_DRAWN)).astype(np.int64)
+    # clothes and the body beneath them have cells of their own
+    place[:, 0] = 2 * place[:, 0] + np.isin(used, faces[part == _WORN])
+    _, cell = unique_rows(place)
     count = np.bincount(cell)
     mean = np.stack([np.bincount(cell, vertices[used, axis]) for axis in range(3)], axis=1) / count[:, None]
     apart = np.linalg.norm(vertices[used] - mean[cell], axis=1)
