@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -155,3 +157,14 @@ def test_bad_surfaces_are_refused():
     huge, faces = joined(sphere(), sphere((0.2, 0.0, 0.0)))
     with pytest.raises(ValueError, match="too large for a grid"):
         close_skin(read_soup(huge, faces), 100.0 * huge)
+
+
+def test_hundreds_of_thousands_of_triangles_take_bounded_memory():
+    soup = joined(sphere(rings=180), sphere((0.2, 0.0, 0.0), rings=180))
+    assert len(soup[1]) > 250_000
+    tracemalloc.start()
+    skin = closed(*soup)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert_watertight(skin)
+    assert len(skin.faces) < 20_000 and most < 0.4e9

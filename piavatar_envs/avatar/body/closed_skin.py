@@ -315,7 +315,9 @@ def _iso_surface(points: np.ndarray, closed: Sequence[np.ndarray], cell: float) 
     from warp.geometry import IsoSurfaceMarchingCubes
 
     init_warp()
-    used = np.unique(np.concatenate([faces.ravel() for faces in closed]))
+    used = np.zeros(len(points), bool)
+    for faces in closed:
+        used[faces] = True
     low = np.floor(points[used].min(axis=0) / cell).astype(int) - 3
     counts = np.ceil(points[used].max(axis=0) / cell).astype(int) + 4 - low
     if np.prod(counts.astype(float)) > MOST_NODES:
@@ -343,14 +345,15 @@ def _iso_surface(points: np.ndarray, closed: Sequence[np.ndarray], cell: float) 
 
 def _unite(field: np.ndarray, points: np.ndarray, faces: np.ndarray, low: np.ndarray, cell: float) -> None:
     """Lower the signed distances at the nodes about a shell to its own [m]."""
-    used, own = np.unique(faces, return_inverse=True)
-    corners = points[used]
+    used = np.zeros(len(points), bool)
+    used[faces] = True
+    own, corners = (np.cumsum(used) - 1)[faces], points[used]
     first = np.maximum(np.floor(corners.min(axis=0) / cell).astype(int) - low - 3, 0)
     last = np.minimum(np.ceil(corners.max(axis=0) / cell).astype(int) - low + 4, field.shape)
     part = field[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
     nodes = np.stack(np.meshgrid(*[np.arange(n) for n in part.shape], indexing="ij"), axis=-1).reshape(-1, 3)
     nodes = ((nodes + first + low) * cell).astype(np.float32)
-    distance = ClosedSurface(corners, own.reshape(-1, 3).astype(np.int32)).distance_near(nodes, _BAND * cell)
+    distance = ClosedSurface(corners, own.astype(np.int32)).distance_near(nodes, _BAND * cell)
     np.minimum(part, distance.reshape(part.shape), out=part)
 
 
