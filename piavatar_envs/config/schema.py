@@ -439,11 +439,14 @@ def _settings_of(section: type[BaseModel]) -> AfterValidator:
 
 
 class RegionConfig(BaseModel):
-    """Flesh of another material about some joints, such as hair, a garment or a stiff boot."""
+    """Flesh of another material about some joints or below some surfaces, such as hair, a garment or a stiff boot."""
 
     model_config = FROZEN
 
-    joints: tuple[JointName, ...] = Field(..., min_length=1, description="names of the joints whose flesh it is")
+    joints: tuple[JointName, ...] = Field((), description="names of the joints whose flesh it is; empty for all")
+    surfaces: tuple[str, ...] = Field(
+        (), description="names of materials of the avatar's file below which it lies; empty for all"
+    )
     beyond: float = Field(
         0.0, ge=0.0, le=FARTHEST, description="least distance of the flesh from the nearest bone particle [m]"
     )
@@ -461,6 +464,13 @@ class RegionConfig(BaseModel):
     damping_ratio: float | None = Field(
         None, ge=0.0, le=MOST_DAMPING, description="damping ratio at 25 Hz; null as the rest [-]"
     )
+
+    @model_validator(mode="after")
+    def _check_place(self) -> RegionConfig:
+        """Refuse a region of the whole body."""
+        if not self.joints and not self.surfaces:
+            raise ConfigError("joints and surfaces are both empty; name some of either")
+        return self
 
 
 class AvatarConfig(BaseModel):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -272,18 +273,36 @@ class Flesh:
         """Return the mask of a region's particles, shape ``(P,)`` bool.
 
         Raises:
-            ConfigError: the region has no particles.
+            ConfigError: the region has no particles, or the avatar has no surface of such a name.
         """
-        joints = [joint_index(name) for name in region.joints]
-        sampled = self.sampled
-        inside = np.isin(sampled.skin_joints[:, 0], joints)
+        sampled, inside = self.sampled, np.ones(len(self.sampled), bool)
+        if region.joints:
+            inside &= np.isin(sampled.skin_joints[:, 0], [joint_index(name) for name in region.joints])
+        if region.surfaces:
+            inside &= self._below(region.surfaces)
         if region.beyond > 0.0:
             inside &= bone_distance(sampled.rest_positions, sampled.bone) > region.beyond
         if not inside.any():
             raise ConfigError(
-                f"scene.avatars: no flesh of {list(region.joints)} is beyond={region.beyond} m from the bones; use less"
+                f"scene.avatars: no flesh of {[*region.joints, *region.surfaces]} is beyond={region.beyond} m from the "
+                "bones; use less, or name more"
             )
         return inside
+
+    def _below(self, surfaces: Sequence[str]) -> np.ndarray:
+        """Return the mask of the particles whose nearest point of the skin is on some surfaces, shape ``(P,)`` bool.
+
+        Raises:
+            ConfigError: the avatar has no surface of such a name.
+        """
+        names = self.asset.surface_names
+        unknown = [name for name in surfaces if name not in names]
+        if unknown:
+            there = f"there are {', '.join(names)}" if names else "this avatar has none with names"
+            raise ConfigError(f"scene.avatars: no surface {unknown[0]!r}; {there}")
+        nearest = self.sampled.anchor_weights.argmax(axis=1)[:, None]
+        corner = np.take_along_axis(self.sampled.anchor_vertices, nearest, axis=1)[:, 0]
+        return np.isin(self.asset.surfaces[corner], [names.index(name) for name in surfaces])
 
 
 def pose_control(settings: PoseControlConfig, model: Model) -> PoseControl:

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+import piavatar_envs
 from piavatar_envs.avatar.body.asset import mesh_volume
-from piavatar_envs.avatar.body.character import Character, body_of, to_reference_pose, with_all_joints
+from piavatar_envs.avatar.body.character import Character, Surface, body_of, to_reference_pose, with_all_joints
 from piavatar_envs.avatar.body.sampling import sample_particles
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS
+from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.sim.world import Simulation
 from tests.avatar.characters import SKIN_COLOR, in_t_pose
 
 
@@ -112,6 +115,30 @@ def test_a_look_of_too_many_triangles_is_drawn_with_fewer(character, monkeypatch
     # no triangle joins the skirt to the body
     blue = (look.colors == (20, 30, 200)).all(axis=1)[look.faces]
     assert (blue.all(axis=1) | ~blue.any(axis=1)).all() and blue.any()
+
+
+def test_flesh_below_a_surface_of_the_file_is_of_another_material(character, device):
+    boots = (character.vertices[character.faces, 2] < 0.12).all(axis=1)
+    faces = np.concatenate([character.faces[~boots], character.faces[boots]])
+    surfaces = (Surface("body", 0, (~boots).sum(), "Skin"), Surface("boots", (~boots).sum(), len(faces), "Leather"))
+    booted = body_of(dataclasses.replace(character, faces=faces, surfaces=surfaces))
+    assert booted.surface_names == ("Skin", "Leather")
+    piavatar_envs.register_source("booted", lambda: booted)
+
+    def world(**region):
+        avatars = [{"avatar": {"source": "booted"}, "regions": [{"young_modulus": 5.0e5, **region}]}]
+        return Simulation(load_config(EnvConfig, None, {"fidelity": "tiny", "scene.avatars": avatars}), 1, device)
+
+    simulation = world(surfaces=["Leather"])
+    stiff = simulation.model.particles.mu.numpy()[0] * 2.6 > 4.0e5
+    height = simulation.flesh[0].sampled.rest_positions[:, 2] - booted.vertices[:, 2].min()
+    assert stiff[height < 0.08].all() and not stiff[height > 0.16].any()
+    left = world(surfaces=["Leather"], joints=["left_ankle"]).model.particles.mu.numpy()[0] * 2.6 > 4.0e5
+    assert 0 < left.sum() < stiff.sum() and stiff[left].all()
+    with pytest.raises(ConfigError, match=r"no surface 'Silk'; there are Skin, Leather"):
+        world(surfaces=["Silk"])
+    with pytest.raises(ConfigError, match=r"scene\.avatars\.0\.regions\.0.*joints and surfaces are both empty"):
+        world()
 
 
 def test_joints_without_flesh_take_a_share_of_their_parents(character):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -122,7 +123,21 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
         shape_deltas=deltas,
         shape_joints=np.asarray(posed.shape_joints, np.float32).reshape(count, 2, NUM_JOINTS, 3),
         look=_look(posed, flipped, part),
+        **_named_surfaces(character, skin.anchors),
     )
+
+
+def _named_surfaces(character: Character, anchors: sparse.csr_array) -> dict[str, Any]:
+    """Return the parts of the skin by the materials of the surfaces beneath it, by their own names without one."""
+    names = tuple(dict.fromkeys(surface.material or surface.name for surface in character.surfaces))
+    if not names:
+        return {}
+    share = np.zeros((len(character.vertices), len(names)))
+    for surface in character.surfaces:
+        share[
+            np.unique(character.faces[surface.first : surface.last]), names.index(surface.material or surface.name)
+        ] = 1
+    return {"surface_names": names, "surfaces": (anchors @ share).argmax(axis=1).astype(np.int32)}
 
 
 def _closed(character: Character, posed: np.ndarray, cell: float) -> tuple[ClosedSkin, np.ndarray, np.ndarray]:
