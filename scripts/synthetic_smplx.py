@@ -22,7 +22,7 @@ from piavatar_envs.avatar.motion.retarget import align_limbs
 
 SKIN_VERTICES, RINGS, SPOKES, EYE_RADIUS = 9383, 17, 32, 0.0125
 #: Right and up of an eye from the head joint, as shares of the embedded body's height [m].
-EYE_RIGHT, EYE_UP = 0.031, 0.068
+EYE_RIGHT, EYE_UP = 0.031, 0.090
 SIGMAS = 2.5  # of a shape coefficient at the end of the embedded body's range
 CURL = 0.2  # bend of each finger joint in the hands' mean pose [rad]
 BULGE = 0.01  # of a joint bent by a right angle [m]

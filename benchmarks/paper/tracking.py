@@ -53,6 +53,8 @@ class Options(runner.Options):
     model: str | None = None
     #: mesh of a skeleton, or a folder of its parts, for bone particles
     skeleton: str | None = None
+    #: strikes and balls as well
+    disturbances: bool = True
     #: a minute's smoke run: few poses of a tiny body; the figures mean nothing
     quick: bool = False
     #: draw the pictures beside the JSON file
@@ -122,7 +124,8 @@ def plan(options: Options, world: World) -> Iterator[Any]:
         for variant in ("split", "paper"):
             where = replace(world, decoupling=variant, **number)
             yield lambda where=where: bone_particles(few, where)
-    yield from disturbance.plan(options.seeds, options.quick, world)
+    if options.disturbances:
+        yield from disturbance.plan(options.seeds, options.quick, world)
 
 
 def table_1(

@@ -52,39 +52,74 @@ def build(
         FileNotFoundError: there is no such file.
         ValueError: it is no such model, or has fewer coefficients than the settings name.
     """
+    model, shaped, counts = _person(path, betas, expression, num_betas, num_expressions)
+    rotations, reference = _reference(model, shaped, flat_hand)
+    character = _character(path, model, shaped, counts, rotations, reference)
+    bones = None
+    if skeleton is not None:
+        rest = model.joints(shaped)[:NUM_JOINTS] @ TO_OURS.T
+        bones = moved(read_skeleton(skeleton, rest, TO_OURS), rest, reference, character.joints)
+    return replace(body_of(character), skeleton=bones)
+
+
+def read_character(
+    path: str,
+    betas: Sequence[float] = (),
+    expression: Sequence[float] = (),
+    num_betas: int | None = None,
+    num_expressions: int | None = None,
+    flat_hand: bool = False,
+) -> Character:
+    """Return the person of a model file in the reference pose; arguments and errors as for :func:`build`."""
+    model, shaped, counts = _person(path, betas, expression, num_betas, num_expressions)
+    return _character(path, model, shaped, counts, *_reference(model, shaped, flat_hand))
+
+
+def _person(
+    path: str, betas: Sequence[float], expression: Sequence[float], num_betas: int | None, num_expressions: int | None
+) -> tuple[SmplModel, np.ndarray, tuple[int, int]]:
+    """Return the model, the person's vertices in the zero pose, and the numbers of shape parameters of either kind."""
     model = read_smpl(path)
     columns, faces = model.shape_dirs.shape[2], model.expression_dirs.shape[2]
     shape, face = _coefficients("betas", betas, columns), _coefficients("expression", expression, faces)
     counts = _count("num_betas", num_betas, columns), _count("num_expressions", num_expressions, faces)
+    return model, model.shaped(shape, face), counts
+
+
+def _character(
+    path: str,
+    model: SmplModel,
+    shaped: np.ndarray,
+    counts: tuple[int, int],
+    rotations: np.ndarray,
+    reference: np.ndarray,
+) -> Character:
+    """Return the character of a person, from :func:`_person`, in the pose of :func:`_reference`."""
     names = *(f"beta_{index}" for index in range(counts[0])), *(f"expression_{index}" for index in range(counts[1]))
-    shaped = model.shaped(shape, face)
-    rotations, reference = _reference(model, shaped, flat_hand)
     displaced = shaped + model.pose_displacement(rotations)
     vertices, joints = _turned(model, displaced, model.joints(shaped), rotations)
-    bones = None
-    if skeleton is not None:
-        rest = model.joints(shaped)[:NUM_JOINTS] @ TO_OURS.T
-        bones = moved(read_skeleton(skeleton, rest, TO_OURS), rest, reference, joints)
     deltas, joint_deltas = np.zeros((len(names), 2, *vertices.shape)), np.zeros((len(names), 2, NUM_JOINTS, 3))
     directions = np.concatenate([model.shape_dirs[..., : counts[0]], model.expression_dirs[..., : counts[1]]], axis=2)
     for index in range(len(names)):
         step = SIGMAS * directions[..., index].astype(np.float64)
         own = _turned(model, step, model.joints(step), rotations)  # which is linear
         deltas[index], joint_deltas[index] = (np.stack([-each, each]) for each in own)
-    character = Character(
+    columns = [f"{dirs.shape[2]} {kind}" for kind, dirs in
+               (("shape", model.shape_dirs), ("expression", model.expression_dirs)) if dirs.shape[2]]  # fmt: skip
+    return Character(
         name=f"{model.kind} ({Path(path).name})",
         vertices=vertices,
         faces=model.faces,
         weights=model.body_weights(),
         joints=joints,
         colors=None,
-        surfaces=(Surface("body", 0, len(model.faces)),),
+        surfaces=(Surface("skin", 0, len(model.faces)),),
         shape_names=names,
         shape_deltas=deltas,
         shape_joints=joint_deltas,
+        notes=(f"{model.kind} of {len(model.parents)} joints with {' and '.join(columns)} coefficients",),
         pose=_pose_displacements(model, rotations, reference),
     )
-    return replace(body_of(character), skeleton=bones)
 
 
 def _coefficients(name: str, values: Sequence[float], most: int) -> np.ndarray:
