@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse
 
 #: Opcodes that are read; a real body model has some hundred.
-MAX_OPCODES = 300_000
+MAX_OPCODES = 100_000
 #: Nesting of arrays in arrays that is followed.
 MAX_DEPTH = 16
 _NUMPY = r"numpy\.(_?core\.(multiarray\.(_reconstruct|scalar)|numeric\._frombuffer)|ndarray|dtype)"

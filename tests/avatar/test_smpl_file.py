@@ -187,10 +187,10 @@ def test_hostile_pickles_are_refused_in_one_line_and_run_nothing(kind, suffix, t
         path.write_bytes(payload)
     else:
         zip_of(path, {"v_template": npy_of_pickle(payload)})
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(ValueError, match="is not an SMPL") as caught:
         read_smpl(path)
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
     assert not evil.exists()
