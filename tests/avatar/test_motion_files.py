@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.motion import Motion, deepmimic, list_motions, load_motion
+from piavatar_envs.avatar.motion import Motion, amass, deepmimic, list_motions, load_motion
 from piavatar_envs.avatar.motion.amass import HIP_DROP, LEG_LENGTH, load_file
 from piavatar_envs.avatar.motion.ground import lowest_heights
 from piavatar_envs.avatar.motion.retarget import leg_length
@@ -184,6 +184,15 @@ def test_units_of_another_kind_are_refused_with_the_likely_cause(tmp_path: Path,
     with pytest.raises(ValueError, match=message):
         load_motion(write(tmp_path / "clip.npz", **changes))
     assert load_motion(write(tmp_path / "clip.npz")).fps == 120.0
+
+
+def test_arrays_that_unpack_to_more_than_the_limit_are_refused_unread(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(amass, "MAX_BYTES", 100_000)
+    path = tmp_path / "bomb.npz"
+    np.savez_compressed(path, poses=np.zeros((1000, 156)), trans=np.zeros((1000, 3)), mocap_framerate=np.array(30.0))
+    assert path.stat().st_size < 100_000
+    with pytest.raises(ValueError, match=r"its arrays have .* bytes, the limit is 100000"):
+        load_file(path, REST)
 
 
 def test_pickles_and_other_files_are_refused_unopened(tmp_path: Path) -> None:

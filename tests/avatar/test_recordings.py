@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.rigs import VRM_JOINTS
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, load_motion
@@ -15,6 +17,7 @@ from piavatar_envs.avatar.motion.bvh import read_bvh
 from piavatar_envs.avatar.motion.gltf_animations import read_animation
 from piavatar_envs.avatar.motion.library import clips_of
 from piavatar_envs.avatar.motion.recording import to_motion
+from tests.avatar.gltf_files import glb
 from tests.avatar.skeletons import X_UP, Y_UP, Y_UP_BACK, Z_UP, Skeleton, mixamo, unreal, write_bvh, write_glb
 
 REST = load_asset().joints.astype(np.float64)
@@ -117,7 +120,7 @@ def test_what_is_no_file_of_a_motion_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"is a folder.*\.bvh"):
         load_motion(tmp_path)
     (tmp_path / "walk.fbx").write_bytes(b"Kaydara FBX Binary")
-    with pytest.raises(ValueError, match=r"walk\.fbx is no motion by its suffix"):
+    with pytest.raises(ValueError, match=r"walk\.fbx is not a motion: it is FBX.*glTF"):
         load_motion(tmp_path / "walk.fbx")
     with pytest.raises(FileNotFoundError, match="no motion file or folder"):
         load_motion(str(tmp_path / "walks"))
@@ -256,6 +259,21 @@ def test_animations_come_back(tmp_path: Path, squat: Motion, kick: Motion, skele
         load_motion(path)
     with pytest.raises(ValueError, match="no animation 'Run'"):
         load_motion(f"{path}#Run")
+
+
+def test_bones_of_a_vrm_animation_need_no_names(tmp_path: Path, kick: Motion) -> None:
+    skeleton = Skeleton(lambda joint: f"n{JOINT_NAMES.index(joint)}", 1.0, Y_UP)
+    content = write_glb(tmp_path / "kick.glb", {"": kick}, REST, skeleton).read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    document = json.loads(content[20 : 20 + length])
+    del document["skins"]
+    spine = {"spine1": "spine", "spine2": "chest", "spine3": "upperChest"}
+    bones = {bone: {"node": 1 + joint_index(joint)} for joint, bone in (VRM_JOINTS | spine).items()}
+    document["extensions"] = {"VRMC_vrm_animation": {"specVersion": "1.0", "humanoid": {"humanBones": bones}}}
+    path = tmp_path / "kick.vrma"
+    path.write_bytes(glb(json.dumps(document).encode(), content[28 + length :]))
+    distance, angle = differences(to_motion(read_animation(path), REST), kick)
+    assert distance < 1e-3 and angle < 1e-3 and load_motion(path).num_frames == kick.num_frames
 
 
 def test_files_without_a_motion_of_a_body_are_refused(tmp_path: Path, squat: Motion) -> None:

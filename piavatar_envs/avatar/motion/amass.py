@@ -8,6 +8,7 @@ up. Files are the user's; nothing is unpickled.
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from piavatar_envs.core.reading import reading
 
 #: Width of ``poses`` -> the key that names the frame rate.
 LAYOUTS: dict[int, str] = {156: "mocap_framerate", 165: "mocap_frame_rate"}
+MAX_BYTES = 2**31  # of all arrays of a file, unpacked: hours of capture
 GREATEST_TURN = 4.0 * np.pi  # [rad] of a joint; axis-angle vectors of recordings may exceed a full turn
 LEG_LENGTH = 0.78  # [m] hip to knee to ankle of a person of SMPL's mean shape, about 1.7 m tall
 HIP_DROP = 0.09  # [m] how far below SMPL's pelvis joint the hips of that person are
@@ -94,6 +96,11 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
     if not path.is_file():
         raise FileNotFoundError(f"no motion file {path}")
     with reading(path, "an AMASS motion"):
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                size = sum(entry.file_size for entry in archive.infolist())
+            if size > MAX_BYTES:
+                raise ValueError(f"its arrays have {size} bytes, the limit is {MAX_BYTES}; cut it into clips")
         content = np.load(path, allow_pickle=False)
         if not isinstance(content, np.lib.npyio.NpzFile):
             raise ValueError("it is a single array, and not an archive of several")

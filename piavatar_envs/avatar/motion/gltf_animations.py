@@ -1,4 +1,4 @@
-"""Animations of glTF, GLB and VRM files as recordings: tracks sampled at an even rate, nodes posed in the scene."""
+"""Animations of glTF, GLB, VRM and VRMA files as recordings: tracks at an even rate, nodes posed in the scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.rigs import map_joints
-from piavatar_envs.avatar.gltf import Animation, Gltf, read_gltf
+from piavatar_envs.avatar.gltf import Animation, Gltf, read_gltf, whole
 from piavatar_envs.avatar.gltf_surfaces import bind_pose
 from piavatar_envs.avatar.motion.recording import Recording, whole_rate
 from piavatar_envs.core.reading import reading
@@ -57,7 +57,7 @@ def read_animation(path: str | Path, name: str | None = None, mapping: Mapping[s
     animation = gltf.animations[0 if name is None else names.index(name)]
     with reading(path, "a glTF motion"):
         rest, lead = _rest(gltf)
-        joint_map = map_joints(_joint_names(gltf), gltf.parents, rest[:, :3, 3], gltf.humanoid, mapping)
+        joint_map = map_joints(_joint_names(gltf), gltf.parents, rest[:, :3, 3], _humanoid(gltf), mapping)
         kept = _with_ancestors(gltf, joint_map.nodes.values())
         moved = {track.node for track in animation.tracks}
         if not moved & set(kept):
@@ -87,6 +87,15 @@ def _joint_names(gltf: Gltf) -> list[str]:
     joints = {int(joint) for skin in gltf.skins for joint in skin.joints}
     meshes = [bool(joints) and "mesh" in node for node in gltf.items("nodes")]
     return ["" if mesh and node not in joints else gltf.names[node] for node, mesh in enumerate(meshes)]
+
+
+def _humanoid(gltf: Gltf) -> dict[str, int] | None:
+    """Return the nodes of VRM's bones, of a character or of an animation without one (VRMA)."""
+    animated = (gltf.json.get("extensions") or {}).get("VRMC_vrm_animation")
+    if animated is None:
+        return gltf.humanoid
+    bones = animated["humanoid"]["humanBones"].items()
+    return {bone: whole(entry["node"], f"node of the bone {bone}", len(gltf.names) - 1) for bone, entry in bones}
 
 
 def _rest(gltf: Gltf) -> tuple[np.ndarray, Rotation]:

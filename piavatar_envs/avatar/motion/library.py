@@ -23,6 +23,7 @@ from piavatar_envs.avatar.motion.bvh import read_bvh
 from piavatar_envs.avatar.motion.deepmimic import lay_hands_on_ground
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.recording import to_motion
+from piavatar_envs.core.reading import reading
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
@@ -32,11 +33,11 @@ RATES = 5.0, 1000.0  # [1/s] of motion capture
 ROOT_SPEED = 20.0  # [m/s] of a pelvis, beyond sprinters and falls
 JOINT_SPEED = 25.0  # [rad/s] of a joint, about that of a punch
 GROUND_WINDOW = 0.8  # [s] longer than most flights; other skeletons stand otherwise than ours, so contact drifts
-GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm", ".vrma")
 #: Endings of files that may be motions.
 SUFFIXES = (".bvh", ".npz", ".txt", *GLTF_SUFFIXES)
-_ANIMATION = re.compile(r"(.+?\.(?:glb|gltf|vrm))#(.+)", re.IGNORECASE)
-FILES = "an AMASS .npz, a .bvh, a .glb, .gltf or .vrm with animations, or a DeepMimic .txt file"
+_ANIMATION = re.compile(r"(.+?\.(?:glb|gltf|vrma?))#(.+)", re.IGNORECASE)
+FILES = "an AMASS .npz, a .bvh, a .glb, .gltf, .vrm or .vrma with animations, or a DeepMimic .txt file"
 
 
 #: Builds a motion for a body from its joint positions in the rest pose ``(22, 3)`` [m].
@@ -88,8 +89,8 @@ def load_motion(
 
     Args:
         name_or_path: an embedded clip (``"squat"``), a registered one, a DeepMimic clip (``"deepmimic:walk"``), or the
-            path of a file: AMASS ``.npz``, ``.bvh``, ``.glb``, ``.gltf`` or ``.vrm`` (one of several animations by
-            ``"hero.glb#Run"``), DeepMimic ``.txt``.
+            path of a file: AMASS ``.npz``, ``.bvh``, ``.glb``, ``.gltf``, ``.vrm`` or ``.vrma`` (one of several
+            animations by ``"hero.glb#Run"``), DeepMimic ``.txt``.
         asset: the avatar that shall move; without it the embedded body.
         body: one of its shapes; without it the mean shape. Legs of another length scale the root's path.
         mapping: names of a skeleton's nodes by joint, for BVH and glTF files whose names say too little.
@@ -150,6 +151,10 @@ def _load_file(path: Path, joints: np.ndarray, mapping: Mapping[str, str] | None
 
         motion = to_motion(read_animation(file, clip, mapping), joints)
     elif suffix not in SUFFIXES and path.exists():
+        from piavatar_envs.avatar.gltf import check_format  # which imports this package
+
+        with reading(path, "a motion"):
+            check_format(path)
         kind = "a folder, of which TrackMotion draws motions" if path.is_dir() else "no motion by its suffix"
         raise ValueError(f"{path} is {kind}; give the path of {FILES}")
     elif suffix not in SUFFIXES:
