@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.body import sampling
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
@@ -35,6 +36,7 @@ from piavatar_envs.config import (
     ShapeConfig,
 )
 from piavatar_envs.config import replace as changed
+from piavatar_envs.core.result_cache import digest_of, kept
 from piavatar_envs.mpm.materials import lame_parameters, material_index, retardation_time
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Model
@@ -149,7 +151,9 @@ class Flesh:
     def shaped(self, parameters: np.ndarray) -> tuple[BodyPoints, np.ndarray]:
         """Return points and volumes [m^3] of one shape."""
         sampled = self.sampled
-        joints, rest, volume = _shape_particles(self.asset, sampled, tuple(parameters))
+        # random shapes are too many to keep
+        keep = np.array_equal(parameters, self.base_parameters)
+        joints, rest, volume = _shape_particles(self.asset, sampled, tuple(parameters), keep)
         points = BodyPoints(
             rest=rest[None],
             mass=self.masses(volume[None]),
@@ -327,13 +331,21 @@ def pose_control(settings: PoseControlConfig, model: Model) -> PoseControl:
 
 
 @lru_cache(maxsize=4)
-def _shape_particles(asset: AvatarAsset, sampled: ParticleSet, parameters: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+def _shape_particles(
+    asset: AvatarAsset, sampled: ParticleSet, parameters: tuple[float, ...], keep: bool
+) -> tuple[np.ndarray, ...]:
     """Return joints, rest positions and volumes of a shape, read-only: avatars and groups of environments share them.
 
     See :meth:`AvatarAsset.shape` and :func:`~piavatar_envs.avatar.body.sampling.morph`.
     """
     body = asset.shape(parameters)
-    arrays = (body.joints, *morph(asset, sampled, body))
+
+    def compute() -> dict[str, np.ndarray]:
+        return dict(zip(("rest", "volume"), morph(asset, sampled, body), strict=True))
+
+    digest = digest_of([asset.vertices, asset.faces, body, sampled], [sampling]) if keep else ""
+    moved = kept("shape", digest, compute, f"shaping the flesh of {asset.name}") if keep else compute()
+    arrays = (body.joints, moved["rest"], moved["volume"])
     for array in arrays:
         array.setflags(write=False)
     return arrays
