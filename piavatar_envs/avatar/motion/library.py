@@ -85,7 +85,7 @@ def load_motion(
 ) -> Motion:
     """Return a motion by name or path, for a body, standing on the ground.
 
-    A file in which a joint turns faster than 25 rad/s is warned of: its capture has glitches, or a wrong frame rate.
+    A joint that turns faster than 25 rad/s is warned of: the capture has glitches, or a wrong frame rate.
 
     Args:
         name_or_path: an embedded clip (``"squat"``), a registered one, a DeepMimic clip (``"deepmimic:walk"``), or the
@@ -115,7 +115,9 @@ def load_motion(
         motion, window = _load_file(Path(name), joints, mapping)
     else:
         raise ValueError(f"unknown motion {name!r}; known are {', '.join(list_motions())}, or the path of {FILES}")
-    if motion.source.startswith("DeepMimic"):
+    if name not in list_embedded():
+        _warn_of_speed(name, motion)
+    if window is not None and motion.source.startswith("DeepMimic"):
         motion = lay_hands_on_ground(motion, asset, body, GROUND_WINDOW)
     motion = motion.on_ground(asset, body, window=window)
     return motion.closed() if loop and not motion.loop and motion.meets_itself() else motion
@@ -180,13 +182,17 @@ def _checked(path: str, motion: Motion) -> Motion:
             f"{path}: the root moves at {steps.max():.3g} m/s in frame {steps.argmax()}, it must be <= {ROOT_SPEED:g}; "
             f"{cause}"
         )
+    return motion
+
+
+def _warn_of_speed(name: str, motion: Motion) -> None:
+    """Warn of joints that turn faster than people's."""
     turns = motion.joint_speeds()
     if turns.max() > JOINT_SPEED:
         frame, joint = np.unravel_index(turns.argmax(), turns.shape)
         warnings.warn(
-            f"{path}: {JOINT_NAMES[joint]} turns at {turns.max():.3g} rad/s in frame {frame}, and "
+            f"{name}: {JOINT_NAMES[joint]} turns at {turns.max():.3g} rad/s in frame {frame}, and "
             f"{np.count_nonzero(turns.max(axis=1) > JOINT_SPEED)} of {motion.num_frames} frames are faster than "
             f"{JOINT_SPEED:g}; its capture may have glitches, or its frame rate be wrong",
-            stacklevel=4,
+            stacklevel=3,
         )
-    return motion
