@@ -77,6 +77,20 @@ def test_version_is_printed(capsys):
     assert capsys.readouterr().out == f"piavatar-envs {piavatar_envs.__version__}\n"
 
 
+def test_the_file_of_an_avatar_chooses_its_source(probe, tmp_path, capsys):
+    file = tmp_path / "scan.ply"
+    file.touch()
+    cli.main(["play", PROBE, "--avatar", str(file), "-c", "avatar.height=1.7", "--steps", "1"])
+    given = {name: value for name, value in probe[0].settings.items() if name.startswith("avatar")}
+    assert given == {"avatar.source": "mesh", "avatar.path": str(file), "avatar.height": 1.7}
+    capsys.readouterr()
+    for name, message in (("none.glb", "there is no file"), ("a.xyz", "no avatar source reads")):
+        (tmp_path / "a.xyz").touch()
+        with pytest.raises(SystemExit):
+            cli.main(["play", PROBE, "--avatar", str(tmp_path / name)])
+        assert message in capsys.readouterr().err
+
+
 def test_list_shows_every_id_with_a_description(capsys):
     cli.main(["list"])
     lines = capsys.readouterr().out.splitlines()

@@ -130,6 +130,14 @@ def test_an_open_skirt_and_held_things_do_not_change_the_volume():
     assert mesh_volume(dressed.vertices, dressed.faces) == pytest.approx(mesh_volume(alone.vertices, alone.faces))
 
 
+@pytest.mark.parametrize(("thickness", "body"), [(0.002, False), (0.02, True)])
+def test_closed_cloth_that_the_grid_cannot_resolve_is_worn(thickness, body):
+    plate, faces = sphere()
+    plate = plate * [1.0, 1.0, thickness / (2.0 * RADIUS)]
+    soup = read_soup(*joined(sphere((0.0, 0.0, 0.5)), (plate, faces)))
+    assert [shell.body for shell in soup.shells] == [True, body]
+
+
 def test_cavities_are_filled_and_pieces_apart_are_left_out():
     vertices, faces = joined(sphere(), sphere((0.2, 0.0, 0.0)), sphere((0.6, 0.0, 0.0), 0.08))
     skin = closed(vertices, faces)
