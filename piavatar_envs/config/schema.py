@@ -464,6 +464,13 @@ class RegionConfig(BaseModel):
     damping_ratio: float | None = Field(
         None, ge=0.0, le=MOST_DAMPING, description="damping ratio at 25 Hz; null as the rest [-]"
     )
+    soft_tissue: float | None = Field(
+        None,
+        ge=0.0,
+        le=1.0,
+        description="share of a change of commanded motion that its flesh misses, under pose control; null as the rest "
+        "[-]",
+    )
 
     @model_validator(mode="after")
     def _check_place(self) -> RegionConfig:
@@ -667,6 +674,11 @@ class EnvConfig(BaseModel):
         """Refuse an avatar's settings of another mode than the environment's."""
         for index, avatar in enumerate(self.scene.avatars):
             _check_control(self.control.mode, avatar.control, f"scene.avatars.{index}.")
+            if self.control.mode != "pose" and any(region.soft_tissue is not None for region in avatar.regions):
+                raise ConfigError(
+                    f"scene.avatars.{index}.regions: soft_tissue belongs to control.mode='pose', and has no effect "
+                    f"under {self.control.mode!r}; leave it out"
+                )
         return self
 
     @model_validator(mode="after")

@@ -154,6 +154,8 @@ class Flesh:
         # random shapes are too many to keep
         keep = np.array_equal(parameters, self.base_parameters)
         joints, rest, volume = _shape_particles(self.asset, sampled, tuple(parameters), keep)
+        lag = velocity_lag(self.control.soft_tissue, self._softness(rest))
+        lag = np.where(sampled.bone < 0, self._region_values("soft_tissue", lag), lag)  # bones miss nothing
         points = BodyPoints(
             rest=rest[None],
             mass=self.masses(volume[None]),
@@ -161,7 +163,7 @@ class Flesh:
             skin_joints=sampled.skin_joints,
             skin_weights=sampled.skin_weights,
             bone=sampled.bone,
-            velocity_lag=velocity_lag(self.control.soft_tissue, self._softness(rest))[None],
+            velocity_lag=lag[None],
             correctives=self._correctives,
         )
         return points, volume[None]

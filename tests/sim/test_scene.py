@@ -84,6 +84,18 @@ def test_regions_are_of_another_material(device):
     assert density[ankle] == pytest.approx(1200.0, rel=1e-4) and density[~ankle] == pytest.approx(1000.0, rel=1e-4)
 
 
+def test_flesh_of_a_region_misses_a_share_of_commanded_motion_of_its_own(device):
+    avatars = [{"regions": [{"joints": ["head"], "soft_tissue": 0.6}]}]
+    simulation = world(device, avatars=avatars)
+    sampled, lag = simulation.flesh[0].sampled, simulation.avatars[0].body.velocity_lag.numpy()[0]
+    head = (sampled.skin_joints[:, 0] == JOINT_NAMES.index("head")) & (sampled.bone < 0)
+    assert head.any() and lag[head] == pytest.approx(0.6)
+    usual = world(device).avatars[0].body.velocity_lag.numpy()[0]
+    assert np.array_equal(lag[~head], usual[~head])
+    with pytest.raises(ConfigError, match=r"soft_tissue belongs to control.mode='pose', and has no effect under 'tor"):
+        load_config(EnvConfig, None, {"control": "torque", "scene.avatars": avatars})
+
+
 def test_matter_has_viscosity_of_its_own(device):
     # As a viscosity or as a damping ratio, of the flesh, of a region of it, and of a prop, which has none unless given.
     avatars = [{"physics": {"damping_ratio": 0.1}, "regions": [{"joints": ["head"], "viscosity": 50.0}]}]
