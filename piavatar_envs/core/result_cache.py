@@ -2,7 +2,7 @@
 
 A file is named by a digest of all that its content depends on: the arguments, and the code that computes it. Nothing is
 ever stale, therefore, and a file that cannot be read is computed anew. Without a place to write to, results are
-computed in every process.
+computed in every process. When the folder grows too large, files that were not used for longest go.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ from piavatar_envs.core.reading import UNREADABLE
 FOLDER = "piavatar_envs"
 #: Results that were computed in less are not kept [s].
 LEAST_SECONDS = 1.0
+#: Size of the folder beyond which old files are deleted [bytes].
+MOST_BYTES = 4 << 30
 #: Time after which a line says what is being computed [s].
 PATIENCE = 2.0
 
@@ -90,7 +92,10 @@ def kept(name: str, digest: str, compute: Callable[[], Arrays], doing: str) -> d
     init_warp()
     path = Path(wp.config.kernel_cache_dir) / FOLDER / f"{name}_{digest}.npz"
     with suppress(*UNREADABLE), np.load(path, allow_pickle=False) as file:
-        return {key: file[key] for key in file.files}
+        found = {key: file[key] for key in file.files}
+        with suppress(OSError):
+            path.touch()  # a folder that can only be read is fine
+        return found
     began = time.perf_counter()
     with _announced(f"piavatar-envs: {doing}; the first time takes a while"):
         arrays = dict(compute())
@@ -115,6 +120,22 @@ def _write(path: Path, arrays: Arrays) -> None:
             os.replace(part, path)
         except OSError:
             os.unlink(part)
+        _prune(path)
+
+
+def _prune(newest: Path) -> None:
+    """Delete files other than ``newest``, the longest unused first, until the folder is within :data:`MOST_BYTES`.
+
+    Raises:
+        OSError: another process has deleted one meanwhile, or the folder cannot be read.
+    """
+    files = sorted((file.stat().st_mtime, file) for file in newest.parent.glob("*.npz") if file != newest)
+    size = newest.stat().st_size + sum(file.stat().st_size for _, file in files)
+    for _, file in files:
+        if size <= MOST_BYTES:
+            return
+        size -= file.stat().st_size
+        file.unlink()
 
 
 @contextmanager

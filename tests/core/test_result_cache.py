@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 
 import numpy as np
 import pytest
@@ -82,6 +83,18 @@ def test_quick_results_and_folders_that_cannot_be_written_leave_no_file(folder, 
     monkeypatch.setattr(result_cache, "LEAST_SECONDS", 60.0)
     kept("thing", "0123", work, "working")
     assert not folder.exists()
+
+
+def test_files_that_were_not_used_for_longest_go_when_the_folder_is_full(folder, monkeypatch):
+    work = Work()
+    for number, digest in enumerate(("first", "second", "third")):
+        kept("thing", digest, work, "working")
+        os.utime(folder / f"thing_{digest}.npz", (number, number))
+    size = (folder / "thing_first.npz").stat().st_size
+    kept("thing", "first", work, "working")  # used again
+    monkeypatch.setattr(result_cache, "MOST_BYTES", 2 * size)
+    kept("thing", "fourth", work, "working")
+    assert {path.name for path in folder.iterdir()} == {"thing_first.npz", "thing_fourth.npz"}
 
 
 def test_a_digest_tells_values_types_and_code_apart():
