@@ -53,6 +53,8 @@ class Options(runner.Options):
     model: str | None = None
     #: mesh of a skeleton, or a folder of its parts, for bone particles
     skeleton: str | None = None
+    #: Tables 1 and 2
+    tables: bool = True
     #: strikes and balls as well
     disturbances: bool = True
     #: a minute's smoke run: few poses of a tiny body; the figures mean nothing
@@ -89,6 +91,22 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 def plan(options: Options, world: World) -> Iterator[Any]:
     """Yield every measurement, as a function that yields its rows."""
+    if options.tables:
+        yield from tables(options, world)
+    few = replace(options, sequences=min(2, options.sequences))
+    ten_times = [{"bone_rings": rings} for rings in (4, 8 if options.quick else 40)]
+    if options.skeleton:  # points of a surface
+        ten_times = [{"bone_voxel": voxel} for voxel in (1.0, 0.7 if options.quick else 10.0**-0.5)]
+    for number in ten_times:
+        for variant in ("split", "paper"):
+            where = replace(world, decoupling=variant, **number)
+            yield lambda where=where: bone_particles(few, where)
+    if options.disturbances:
+        yield from disturbance.plan(options.seeds, options.quick, world)
+
+
+def tables(options: Options, world: World) -> Iterator[Any]:
+    """Yield the measurements of Tables 1 and 2, struck and unstruck."""
     medium = replace(world, fidelity="medium")
     runs = [(replace(world, decoupling=v), BARE, options.seeds) for v in VARIANTS]
     runs += [
@@ -116,16 +134,6 @@ def plan(options: Options, world: World) -> Iterator[Any]:
     for variant in VARIANTS:
         where = replace(world, decoupling=variant)
         yield lambda where=where: table_2(options, where, usual, options.struck_poses, strike=STRIKE)
-    few = replace(options, sequences=min(2, options.sequences))
-    ten_times = [{"bone_rings": rings} for rings in (4, 8 if options.quick else 40)]
-    if options.skeleton:  # points of a surface
-        ten_times = [{"bone_voxel": voxel} for voxel in (1.0, 0.7 if options.quick else 10.0**-0.5)]
-    for number in ten_times:
-        for variant in ("split", "paper"):
-            where = replace(world, decoupling=variant, **number)
-            yield lambda where=where: bone_particles(few, where)
-    if options.disturbances:
-        yield from disturbance.plan(options.seeds, options.quick, world)
 
 
 def table_1(
