@@ -82,7 +82,9 @@ def inspect_command(
     from piavatar_envs.config import parse_assignments
 
     doctor.quiet_warp()
-    inspection.show(inspection.examine(file, parse_assignments(config), picture), as_json=json)
+    # as an environment has them, too
+    settings = {name.removeprefix("avatar."): value for name, value in parse_assignments(config).items()}
+    inspection.show(inspection.examine(file, settings, picture), as_json=json)
 
 
 def play_command(

@@ -50,7 +50,7 @@ def knight(tmp_path_factory):
 
 
 def test_a_report_names_joints_size_and_what_is_worn(knight, capsys):
-    cli.main(["inspect", str(knight), "--json", "-c", "height=1.75"])
+    cli.main(["inspect", str(knight), "--json", "-c", "avatar.height=1.75"])  # as for play and watch
     report = json.loads(capsys.readouterr().out)
     joints = ", ".join(report["joints"])
     assert "left_elbow = mixamorig:LeftForeArm" in joints and "spine3 = mixamorig:Spine2" in joints

@@ -25,12 +25,14 @@ from piavatar_envs.sim.forces import Target
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from piavatar_envs.render import Arrow, Body, Marker, Scene, Skin
+    from piavatar_envs.render import Arrow, Body, Camera, Marker, Scene, Skin
     from piavatar_envs.render.live import Drag, LiveView
 
 #: Render modes of one environment, and of a batch: a live view shows one.
 RENDER_MODES = ("rgb_array", "human")
 BATCH_RENDER_MODES = ("rgb_array",)
+#: Height of the bodies that tasks place their cameras for, at most [m].
+SHOWN_HEIGHT = 1.8
 #: Modules that pictures need.
 _DRAWING = ("pyvista", "PIL")
 #: Least time between two scenes sent to a browser [s]: no screen shows more.
@@ -186,6 +188,18 @@ class Progress:
         return (now[3] - before[3]) * batch.config.physics.control_dt
 
 
+def camera_of(batch: BatchEnv) -> Camera:
+    """Return the task's camera, farther from bodies taller than :data:`SHOWN_HEIGHT` unless settings place it."""
+    from piavatar_envs.render import Camera
+
+    task, render = batch.task, batch.config.render
+    size = max(1.0, max(flesh.height for flesh in batch.simulation.flesh) / SHOWN_HEIGHT)
+    if render.camera_position is not None or render.camera_target is not None:
+        size = 1.0
+    position, target = (tuple(size * value for value in place) for place in (task.camera_position, task.camera_target))
+    return Camera(position, target)
+
+
 class Picture:
     """Draws environments of a batch with one renderer."""
 
@@ -195,10 +209,10 @@ class Picture:
         Raises:
             ImportError: the extra ``render`` is not installed.
         """
-        from piavatar_envs.render import Camera, Renderer
+        from piavatar_envs.render import Renderer
 
-        self.config, task = config, batch.task
-        self.renderer = Renderer(config.width, config.height, Camera(task.camera_position, task.camera_target))
+        self.config = config
+        self.renderer = Renderer(config.width, config.height, camera_of(batch))
         self._scenes = SceneReader(batch)
 
     def cut(self) -> None:
@@ -450,11 +464,9 @@ class Live:
             ValueError: a port out of range.
         """
         if self._view is None:
-            from piavatar_envs.render import Camera
             from piavatar_envs.render.live import LiveView
 
-            task = self._batch.task
-            self._view = LiveView(Camera(task.camera_position, task.camera_target), self._port)
+            self._view = LiveView(camera_of(self._batch), self._port)
         return self._view
 
     def begin(self) -> None:

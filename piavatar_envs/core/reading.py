@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import lzma
 import pickle
 import struct
 import tokenize
+import urllib.parse
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 
 #: Errors of parsers (NumPy, zipfile, json, yaml, torch) on content that is damaged, foreign or too deeply nested.
@@ -18,6 +21,23 @@ UNREADABLE: tuple[type[Exception], ...] = (
     TypeError, ValueError, lzma.LZMAError, pickle.UnpicklingError, struct.error, tokenize.TokenError,
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
+
+#: Greatest number of entries of a folder that count as its content.
+_MOST_ENTRIES = 10_000
+
+
+def files_behind(path: Path) -> list[Path]:
+    """Return the files that a path stands for: itself, of a ``.gltf`` those that it names, of a folder all below it."""
+    if path.is_dir():
+        return sorted(file for file in islice(path.rglob("*"), _MOST_ENTRIES) if file.is_file())
+    found = [path]
+    if path.suffix.lower() == ".gltf":
+        with suppress(*UNREADABLE):  # its reader says what is wrong
+            document = json.loads(path.read_text(encoding="utf-8"))
+            names = [entry.get("uri") for key in ("buffers", "images") for entry in document.get(key, [])]
+            beside = [path.parent / urllib.parse.unquote(name) for name in names if name and name[:5] != "data:"]
+            found += [file for file in beside if file.is_file()]
+    return found
 
 
 def first_line(error: Exception) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from piavatar_envs.config.errors import shown
-from piavatar_envs.core.reading import UNREADABLE
+from piavatar_envs.core.reading import UNREADABLE, files_behind
 
 #: Name of the settings in a state.
 SETTINGS = "env.settings"
@@ -97,28 +97,41 @@ def _check_finite(name: str, value: np.ndarray, failed: np.ndarray) -> None:
 def file_digests(config: BaseModel) -> dict[str, str]:
     """Return a digest of every file that a setting names by its path (a clip, a mesh), by the setting's dotted name.
 
-    A file may be followed by ``#`` and the name of a part. Of a folder, the names and contents of all its files count.
+    A file may be followed by ``#`` and the name of a part. Of a folder, the names and contents of all its files count,
+    of a ``.gltf`` those of the files that it names.
     """
 
     def files(value: Any, name: str) -> Iterator[tuple[str, Path]]:
         if isinstance(value, (Mapping, list)):
             for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
                 yield from files(item, f"{name}.{key}" if name else str(key))
-        elif isinstance(value, str) and (Path(value).suffix or "/" in value):
+        elif isinstance(value, str) and (Path(value).suffix or _may_be_folder(name, value)):
             paths = (Path(text) for text in (value, value.rpartition("#")[0]) if text)
-            yield from ((name, path) for path in paths if path.is_file() or ("/" in value and path.is_dir()))
+            folder = _may_be_folder(name, value)
+            yield from ((name, path) for path in paths if path.is_file() or (folder and path.is_dir()))
 
     return {name: _digest(path) for name, path in files(config.model_dump(mode="json"), "")}
 
 
+def _may_be_folder(name: str, value: str) -> bool:
+    """Return whether a setting may name a folder: by a slash, or where an avatar source takes it as a path anyway."""
+    *sections, last = name.split(".")
+    return "/" in value or ("avatar" in sections and last != "source")
+
+
 def _digest(path: Path) -> str:
-    """Return a digest of a file, or of all files of a folder."""
-    if path.is_file():
-        return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    digest = hashlib.sha256()
-    for file in sorted(file for file in path.rglob("*") if file.is_file()):
-        digest.update(f"{file.relative_to(path).as_posix()}\0{_digest(file)}\n".encode())
+    """Return a digest of a file, or of all files of a folder or of a ``.gltf``."""
+    files = files_behind(path)
+    if files == [path]:
+        return _digest_of_file(path)
+    folder, digest = path if path.is_dir() else path.parent, hashlib.sha256()
+    for file in files:
+        digest.update(f"{file.relative_to(folder).as_posix()}\0{_digest_of_file(file)}\n".encode())
     return digest.hexdigest()[:16]
+
+
+def _digest_of_file(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def settings_rows(config: BaseModel, num_envs: int, files: Mapping[str, str]) -> np.ndarray:

@@ -72,6 +72,7 @@ class Flesh:
         physics, control, shape: sections of the configuration, with the avatar's own settings merged in.
         asset, sampled: the body, and its particles in the mean shape.
         part: index into ``BODY_PARTS`` of every particle, shape ``(P,)`` int32.
+        height: of the particles of the configured shape at rest [m].
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Flesh:
         self.part = body_part_of_joint()[sampled.skin_joints[:, 0]].astype(np.int32)
         self._correctives = pose_correctives(asset, sampled) if self.keeps_volume else None
         self._points, self._volume = self.shaped(self.base_parameters)
+        self.height = float(np.ptp(self._points.rest[0][:, 2]))
         if self.shape.randomize:
             self._points, self._volume = _repeat(self._points, num_envs), np.repeat(self._volume, num_envs, 0)
         self._pool: tuple[Bodies, wp.array] | None = None

@@ -17,6 +17,8 @@ from piavatar_envs.sim.bodies import NUM_PARTS, Flesh
 GROUND = "ground"
 #: Distance by which the domain of bodies without a held root is wider: the reach of a falling body [m].
 FALL = 1.2
+#: Height of the bodies for which the default domain has room [m].
+TALLEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,15 @@ class Domain:
             return self
         aside = np.array([FALL, FALL, 0.0])
         return Domain(tuple((np.array(self.lower) - aside).tolist()), tuple((np.array(self.upper) + aside).tolist()))
+
+    def for_height(self, height: float) -> Domain:
+        """Return the box for bodies of a height [m], larger as the default one would be beyond :data:`TALLEST`."""
+        more = max(height / TALLEST - 1.0, 0.0)
+        usual = Domain()
+        aside = () if self.fenced else (0, 1)
+        lower = [at + more * usual.lower[axis] if axis in aside else at for axis, at in enumerate(self.lower)]
+        upper = [at + more * usual.upper[axis] if axis in (*aside, 2) else at for axis, at in enumerate(self.upper)]
+        return replace(self, lower=tuple(lower), upper=tuple(upper))
 
     def walls(self) -> tuple[Collider, ...]:
         """Return smooth planes at the sides and the top of the box."""

@@ -31,11 +31,17 @@ _OF_BODY = ("rest", "rest_joint", "rest_center", "bone_mass", "velocity_lag")
 
 
 def check_shape_names(flesh: Sequence[Flesh]) -> None:
-    """Refuse random shapes of bodies that have different shape parameters.
+    """Refuse random shapes of bodies that have different shape parameters, or none.
 
     Raises:
-        ConfigError: the parameters of one would be observed under the names of another.
+        ConfigError: the parameters of one would be observed under the names of another, or no body would vary.
     """
+    fixed = [body for body in flesh if body.shape.randomize and not body.asset.shape_names]
+    if fixed:
+        raise ConfigError(
+            f"shape.randomize=True, but the body of {fixed[0].asset.name} has no shape parameters; leave it out, or "
+            "use a source that has some, such as embedded"
+        )
     names = {body.asset.shape_names for body in flesh}
     if len(names) > 1 and any(body.shape.randomize for body in flesh):
         raise ConfigError("shape.randomize=True needs avatars with the same shape parameters; use one avatar.source")

@@ -133,7 +133,7 @@ class Simulation:
         ]
 
     def _set_domain(self, domain: Domain | None) -> tuple[Collider, ...]:
-        """Set the domain, wider for bodies under torque control, and return the walls around it.
+        """Set the domain, wider for tall bodies and under torque control, and return the walls around it.
 
         Raises:
             ConfigError: a prop would begin outside of it, in a solid or in another prop.
@@ -141,6 +141,7 @@ class Simulation:
         props, solids = self.scene.props, self._solids
         domain = domain or Domain().around([avatar.position for avatar in self._avatar_configs])
         walled = self.scene.walls and (bool(solids) or len(self.flesh) > 1 or domain.fenced)
+        domain = domain.for_height(max(flesh.height for flesh in self.flesh))
         self.domain = domain.for_falls(walled) if any(self._torque) else domain
         # a task places its own props at every reset, so that only those of the settings are checked
         configured = {prop.name for prop in self.config.scene.props}

@@ -10,7 +10,7 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.config import ControlConfig, PoseControlConfig, SceneConfig
+from piavatar_envs.config import ConfigError, ControlConfig, PoseControlConfig, SceneConfig
 from piavatar_envs.config.schema import Place
 from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
@@ -169,8 +169,14 @@ most 1, half of it for the goal."""
         return self.ball_places(drift=config.ball_speed * time)
 
     def allocate(self, env) -> None:
-        super().allocate(env, TOUCH_HEIGHT)
         config, (low, high) = self.config, self.config.ball_height
+        tall = env.simulation.flesh[0].height
+        if low < tall + config.ball_radius:
+            raise ConfigError(
+                f"ball_height={list(config.ball_height)} m begins in the head of a body of {tall:.2f} m; use at least "
+                f"{tall + config.ball_radius + 0.3:.2f} m"
+            )
+        super().allocate(env, TOUCH_HEIGHT)
         self.fall = fill(Fall(), config.physics, speed=config.ball_speed, low=low, high=high)
 
     def record_ball(self, env, graph) -> None:

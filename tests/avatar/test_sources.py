@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 import piavatar_envs
+from piavatar_envs.api.pictures import SHOWN_HEIGHT, camera_of
 from piavatar_envs.avatar.body.sources import list_sources, load_asset
 from piavatar_envs.avatar.motion import list_motions, load_motion
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.envs.state import file_digests
 from piavatar_envs.sim.world import Simulation
+from piavatar_envs.tasks.track_motion import TrackMotionConfig
 
 REACH, TRACK = "PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"
 
@@ -167,6 +170,75 @@ def test_a_file_that_changed_is_read_again(tmp_path):
     before = load_asset("scaled", str(file))
     file.write_text("0.75")
     assert np.ptp(load_asset("scaled", str(file)).vertices) == pytest.approx(1.5 * np.ptp(before.vertices))
+
+
+def test_a_changed_folder_and_files_beside_a_gltf_are_read_again(tmp_path):
+    folder, gltf = tmp_path / "bones", tmp_path / "a.gltf"
+    folder.mkdir()
+    gltf.write_text('{"buffers": [{"uri": "its%20data.bin"}]}')
+    read = []
+    piavatar_envs.register_source("counted", lambda path: read.append(path) or load_asset())
+    for path, file in ((folder, folder / "tibia_l.ply"), (gltf, tmp_path / "its data.bin")):
+        file.write_text("0")
+        config = load_config(EnvConfig, None, {"avatar": {"source": "counted", "path": str(path)}})
+        digests = []
+        for content in ("1", "1", "22"):
+            file.write_text(content) if file.read_text() != content else None
+            load_asset("counted", path)
+            digests.append(file_digests(config)["avatar.path"])
+        assert read == [str(path)] * 2 and digests[0] == digests[1] != digests[2]
+        read.clear()
+
+
+def test_folders_of_an_avatar_need_no_slash_to_be_part_of_a_state(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("bones", "embedded", "step"):
+        (tmp_path / name).mkdir()
+    config = load_config(TrackMotionConfig, None, {"avatar.skeleton": "bones", "motion": "step"})
+    assert set(file_digests(config)) == {"avatar.skeleton"}
+
+
+@pytest.mark.parametrize(
+    ("source", "settings", "message"),
+    [
+        ("glb", {"height": "tall"}, "height='tall': it must be a valid number"),
+        ("glb", {"height": True}, "height=True: it must be a valid number"),
+        ("smplx", {"flat_hand": "no"}, "flat_hand='no': it must be a valid boolean"),
+        ("smplx", {"betas": 1.0}, "betas=1.0: it must be a list"),
+        ("smplx", {"num_betas": 2.5}, "num_betas=2.5: it must be a valid integer"),
+    ],
+)
+def test_values_of_another_type_are_refused(source, settings, message):
+    with pytest.raises(ConfigError, match=f"^avatar: avatar source '{source}' has {message}"):
+        load_config(EnvConfig, None, {"avatar": {"source": source, "path": "a.glb", **settings}})
+
+
+def test_bodies_without_shape_parameters_refuse_shapes(device):
+    asset = load_asset()
+    none = dataclasses.replace(
+        asset, shape_names=(), shape_deltas=asset.shape_deltas[:0], shape_joints=asset.shape_joints[:0]
+    )
+    piavatar_envs.register_source("rigid", lambda: none)
+    shapes = [{"randomize": True}, {"parameters": {"weight": 0.5}}]
+    for shape, message in zip(shapes, ["no shape parameters; leave", "'weight'; this body has none"], strict=True):
+        with pytest.raises(ConfigError, match=message):
+            make(REACH, device, avatar={"source": "rigid"}, shape=shape)
+
+
+@pytest.mark.parametrize("height", [1.1, 2.95])
+def test_small_and_tall_bodies_have_room(device, height):
+    asset = load_asset()
+    factor = np.float32(height / np.ptp(asset.vertices[:, 2]))
+    lengths = {name: factor * getattr(asset, name) for name in ("vertices", "joints", "shape_deltas", "shape_joints")}
+    sized = dataclasses.replace(asset, **lengths)
+    piavatar_envs.register_source("sized", lambda: sized)
+    env = make(REACH, device, avatar={"source": "sized"})
+    env.reset(seed=0)
+    *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert info["failure"] == 0
+    camera, shown = camera_of(env.batch), 2.95 / SHOWN_HEIGHT if height > 2.0 else 1.0
+    np.testing.assert_allclose(camera.position, shown * np.array(env.batch.task.camera_position), rtol=0.05)
+    env.close()
 
 
 def test_a_source_reads_the_file_that_it_is_given(tmp_path):

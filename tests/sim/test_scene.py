@@ -36,6 +36,14 @@ def test_as_many_avatars_as_the_scene_says(device):
     assert upper[0] >= Domain().upper[0] + 0.8 * (count - 1) - 1e-3
 
 
+def test_the_domain_grows_with_bodies_taller_than_it_is_made_for():
+    usual, ring = Domain(), Domain(fenced=True)
+    assert usual.for_height(1.7) == usual.for_height(2.0) == usual
+    assert usual.for_height(3.0).upper == pytest.approx((2.4, 2.4, 3.9))
+    assert usual.for_height(3.0).lower == pytest.approx((-2.4, -2.4, -0.3))
+    assert ring.for_height(3.0).upper == pytest.approx((1.6, 1.6, 3.9)) and ring.for_height(3.0).fenced
+
+
 def test_avatars_have_settings_of_their_own(device):
     avatars = [
         {},

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.body.sources import load_asset, register_source
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.episodes import Episodes
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.common.ball_goal import Course, Gate, closest_pass, draw_gate, passes
@@ -175,6 +179,17 @@ class Shot:
 def test_ranges_that_cannot_be_are_refused(task, name, bounds):
     with pytest.raises(ConfigError, match=rf"{name}(\.0)?=.* (positive|>= 0.001)"):
         load_task(task)(load_config(load_task(task).Config, {name: bounds}, {}))
+
+
+def test_a_ball_that_begins_in_the_head_of_a_tall_body_is_refused(device):
+    asset = load_asset()
+    lengths = {name: 1.5 * getattr(asset, name) for name in ("vertices", "joints", "shape_deltas", "shape_joints")}
+    giant = dataclasses.replace(asset, **lengths)
+    register_source("giant", lambda: giant)
+    cls, settings = load_task(HEADER), {"fidelity": "tiny", "avatar.source": "giant"}
+    with pytest.raises(ConfigError, match=r"ball_height=\[2.5, 2.7\] m begins in the head of a body of 2.*use at"):
+        BatchEnv(cls(load_config(cls.Config, None, settings)), 1, device)
+    BatchEnv(cls(load_config(cls.Config, None, settings | {"ball_height": [2.95, 3.1]})), 1, device)
 
 
 @pytest.mark.parametrize("task", [KICK, HEADER])

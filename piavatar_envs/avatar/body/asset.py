@@ -176,7 +176,8 @@ class AvatarAsset:
         parameters = np.zeros(len(self.shape_names))
         for name, value in values.items():
             if name not in self.shape_names:
-                raise ValueError(f"unknown shape parameter {name!r}; use one of {', '.join(self.shape_names)}")
+                there = f"use one of {', '.join(self.shape_names)}" if self.shape_names else "this body has none"
+                raise ValueError(f"unknown shape parameter {name!r}; {there}")
             parameters[self.shape_names.index(name)] = value
         return parameters
 

@@ -15,11 +15,14 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.gltf import check_format
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import files_behind, reading
 
 #: Builds a body from the source's own settings.
 Builder = Callable[..., AvatarAsset]
@@ -84,10 +87,11 @@ def source_of(path: str | Path) -> str:
 
 
 def check_settings(source: str, settings: Mapping[str, Any]) -> None:
-    """Refuse settings that a source does not have, and too few of them.
+    """Refuse settings that a source does not have, values of another type, and too few of them.
 
     Raises:
-        ValueError: no source has the name, or it lacks one of the settings, or needs one that is not given.
+        ValueError: no source has the name, it lacks one of the settings or takes another type, or needs one that is not
+            given.
     """
     parameters = inspect.signature(_builder(source)).parameters.values()
     kinds = {parameter.kind for parameter in parameters}
@@ -99,6 +103,15 @@ def check_settings(source: str, settings: Mapping[str, Any]) -> None:
     for p in parameters:
         if p.name in own and p.default is inspect.Parameter.empty and p.name not in settings:
             raise ValueError(f"avatar source {source!r} needs the setting {p.name}")
+    # a source of one's own checks its settings itself
+    hints = get_type_hints(_builder(source)) if source in _own_modules() else {}
+    for name in sorted(settings.keys() & hints.keys()):
+        try:
+            TypeAdapter(hints[name]).validate_python(settings[name], strict=True)
+        except ValidationError as error:
+            wanted = error.errors()[0]["msg"].replace("Input should be", "it must be")
+            wanted = wanted.replace("an instance of Sequence", "a list")
+            raise ValueError(f"avatar source {source!r} has {name}={settings[name]!r}: {wanted}") from None
 
 
 def load_asset(source: str = "embedded", path: str | Path | None = None, **settings: Any) -> AvatarAsset:
@@ -129,17 +142,19 @@ def _plain(value: Any) -> Any:
     """Return a setting as a value that can be compared and hashed."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
+    if isinstance(value, np.generic):
+        return value.item()
     if isinstance(value, str) or not hasattr(value, "__iter__"):
         return value
     return tuple(_plain(item) for item in value)
 
 
-def _version(value: Any) -> tuple[int, int] | None:
-    """Return time of change and size of the file that a setting names, so that a changed one is read anew."""
-    if not isinstance(value, str) or not os.path.isfile(value):
+def _version(value: Any) -> tuple[tuple[str, int, int], ...] | None:
+    """Return time of change and size of the files that a setting names, so that changed ones are read anew."""
+    if not isinstance(value, str) or not os.path.exists(value):
         return None
-    status = os.stat(value)
-    return status.st_mtime_ns, status.st_size
+    files = [(str(file), os.stat(file)) for file in files_behind(Path(value))]
+    return tuple((name, status.st_mtime_ns, status.st_size) for name, status in files)
 
 
 @lru_cache(maxsize=16)
