@@ -62,7 +62,9 @@ def reading(path: str | Path, what: str, kind: type[ValueError] = ValueError) ->
     """
     try:
         yield
-    except FileNotFoundError:
-        raise
+    except FileNotFoundError as error:
+        if error.errno is None:
+            raise
+        raise FileNotFoundError(f"no file {error.filename or path}") from error
     except UNREADABLE as error:
         raise kind(f"{path} is not {what}: {first_line(error)}") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,7 @@ from piavatar_envs.avatar.skinning import bones_of, weights_of
 from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ConfigError, EnvConfig
+from piavatar_envs.config import replace as changed
 from piavatar_envs.core.rng import STREAM_DISTURBANCE, STREAM_TASK
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionMap, ActionSpec, keep_within
@@ -43,7 +44,7 @@ LONGEST_LEGS = 1.3
 class TrackMotionConfig(EnvConfig):
     """Settings of TrackMotion."""
 
-    motion: str | tuple[str, ...] = Field(
+    motion: str | Annotated[tuple[str, ...], Field(min_length=1)] = Field(
         "step",
         description="name of a clip, path of a motion file, or of a folder of them (with a slash: ./walks), or a list "
         "of these; each episode draws one motion of all",
@@ -381,8 +382,9 @@ velocity. Files and folders of motions, their split and the figures that PHC rep
     def __init__(self, config: TrackMotionConfig) -> None:
         super().__init__(config)
         dt = config.physics.control_dt
-        asset = load_avatar(config.avatar)
-        parameters = shape_parameters(asset, config.shape)
+        own = self.scene.avatars[0]
+        asset = load_avatar(config.avatar.of_avatar(own.avatar))
+        parameters = shape_parameters(asset, changed(config.shape, own.shape))
         self.pelvis_height = float(asset.shape(parameters).joints[0, 2])
         self.interval = max(1, round(config.impulse_interval / dt))
         sampling = Sampling(dt, max(1, round(config.episode_seconds / dt)), config.random_start)

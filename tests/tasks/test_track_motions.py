@@ -183,3 +183,19 @@ def test_what_took_long_to_read_is_kept_until_a_file_changes(monkeypatch, folder
     text = (own / "short.bvh").read_text()
     (own / "short.bvh").write_text(text.replace("Frame Time: 0.0333333", "Frame Time: 0.0400000"))
     assert load().first[-1] > first.first[-1] and len(loaded) == 9
+
+
+def test_references_are_those_of_the_avatar_in_the_scene(make_batch):
+    """Its source and shape go before the environment's, also where the clip is made."""
+    tall = {"avatars": [{"shape": {"parameters": {"height": 1.0}}}]}
+    heights = [make_batch(TRACK, 1, scene=scene).task.frames.roots[:, 2].max() for scene in ({}, tall)]
+    assert heights[1] > 1.05 * heights[0]
+
+
+def test_no_motions_and_folders_without_a_slash_are_refused(make_batch, tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match="motion"):
+        make_batch(TRACK, 1, motion=[])
+    (tmp_path / "walks").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"write '\./walks'"):
+        make_batch(TRACK, 1, motion="walks")

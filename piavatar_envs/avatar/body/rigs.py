@@ -546,8 +546,10 @@ def _by_hand(mapping: Mapping[str, str], names: list[str]) -> dict[str, int | No
         if not name and joint in REQUIRED:
             raise ValueError(f"mapping leaves {joint} out, which cannot be made from others; name its node")
         if name and name not in names:
-            near = difflib.get_close_matches(name, [n for n in names if n], n=3, cutoff=0.4)
-            raise ValueError(f"mapping takes {joint} from {name!r}, and there is no such node; near are {near}")
+            named = [n for n in names if n]
+            near = difflib.get_close_matches(name, named, n=3, cutoff=0.4)
+            hint = f"; near are {', '.join(near)}" if near else f"; the first are {', '.join(named[:9])}"
+            raise ValueError(f"mapping takes {joint} from {name!r}, and there is no such node{hint}")
         fixed[joint] = names.index(name) if name else None
     return fixed
 

@@ -53,7 +53,8 @@ def read_animation(path: str | Path, name: str | None = None, mapping: Mapping[s
             f"{path} has the animations {', '.join(names)}; name one of them: {Path(path).name}#{names[0]}"
         )
     if not names or (name is not None and name not in names):
-        raise ValueError(f"{path} has no animation{'' if name is None else f' {name!r}'}; it has {list(names)}")
+        has = f"; it has {', '.join(names)}" if names else "; export it with one"
+        raise ValueError(f"{path} has no animation{'' if name is None else f' {name!r}'}{has}")
     animation = gltf.animations[0 if name is None else names.index(name)]
     with reading(path, "a glTF motion"):
         rest, lead = _rest(gltf)

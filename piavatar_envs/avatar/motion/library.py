@@ -113,6 +113,8 @@ def load_motion(
         motion, window = deepmimic.load_installed(name.removeprefix(DEEPMIMIC_PREFIX), joints), GROUND_WINDOW
     elif isinstance(name_or_path, Path) or Path(name).suffix or "/" in name:
         motion, window = _load_file(Path(name), joints, mapping)
+    elif Path(name).is_dir():
+        raise ValueError(f"unknown motion {name!r}; for the folder of that name write './{name}'")
     else:
         raise ValueError(f"unknown motion {name!r}; known are {', '.join(list_motions())}, or the path of {FILES}")
     if name not in list_embedded():
