@@ -50,7 +50,7 @@ def test_every_seed_is_a_stream_of_its_own_in_the_same_episodes(run, device, tmp
 
 
 def test_what_is_no_run_and_one_seed_are_refused(run, tmp_path, monkeypatch):
-    with pytest.raises(SystemExit, match=r"error: .*No such file"):
+    with pytest.raises(SystemExit, match=r"error: .*no file"):
         score_random.main([str(tmp_path)])
     (tmp_path / "results.json").write_text("{}")
     with pytest.raises(SystemExit, match=r"has no config.env_id and config.env"):
