@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import lzma
 import pickle
+import re
 import struct
 import tokenize
 import urllib.parse
@@ -22,7 +23,9 @@ UNREADABLE: tuple[type[Exception], ...] = (
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 
-#: Greatest number of entries of a folder that count as its content.
+#: Name of a file in a ``.gltf``; the document is not parsed, for it may be anything.
+_URI = re.compile(rb'"uri"\s*:\s*("(?!data:)(?:[^"\\]|\\.){1,1000}")')
+#: Greatest number of entries of a folder, or of names in a file, that count as its content.
 _MOST_ENTRIES = 10_000
 
 
@@ -33,10 +36,10 @@ def files_behind(path: Path) -> list[Path]:
     found = [path]
     if path.suffix.lower() == ".gltf":
         with suppress(*UNREADABLE):  # its reader says what is wrong
-            document = json.loads(path.read_text(encoding="utf-8"))
-            names = [entry.get("uri") for key in ("buffers", "images") for entry in document.get(key, [])]
-            beside = [path.parent / urllib.parse.unquote(name) for name in names if name and name[:5] != "data:"]
-            found += [file for file in beside if file.is_file()]
+            names = [json.loads(match[1]) for match in islice(_URI.finditer(path.read_bytes()), _MOST_ENTRIES)]
+            beside = [Path(urllib.parse.unquote(name)) for name in dict.fromkeys(names)]
+            below = [path.parent / file for file in beside if not file.is_absolute()]
+            found += [file for file in below if file.is_file()]
     return found
 
 

@@ -175,7 +175,8 @@ def test_a_file_that_changed_is_read_again(tmp_path):
 def test_a_changed_folder_and_files_beside_a_gltf_are_read_again(tmp_path):
     folder, gltf = tmp_path / "bones", tmp_path / "a.gltf"
     folder.mkdir()
-    gltf.write_text('{"buffers": [{"uri": "its%20data.bin"}]}')
+    names = "".join(f'{{"uri" : "{name}"}}, ' for name in ("data:,x", "its%20data.bin", "/etc/hosts"))
+    gltf.write_text(f'{{"buffers": [{names}[[[')  # and damaged behind
     read = []
     piavatar_envs.register_source("counted", lambda path: read.append(path) or load_asset())
     for path, file in ((folder, folder / "tibia_l.ply"), (gltf, tmp_path / "its data.bin")):
