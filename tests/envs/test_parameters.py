@@ -108,7 +108,7 @@ def test_impulses_and_clips_begin_where_their_parameters_say(make_batch):
     batch.reset(seeds=[1, 2, 3, 4])
     values, interval, dt = by_name(batch), 9, batch.config.physics.control_dt
     start = np.round(values["motion_start"] / dt).astype(int)
-    first = batch.task.rotations[start][:, :, [1, 2, 3, 0]]  # before a step is done
+    first = batch.task.frames.rotations[start][:, :, [1, 2, 3, 0]]  # before a step is done
     commanded = batch.simulation.avatar.state.command_rotation.numpy()
     assert len(set(start.tolist())) > 1 and np.abs((first * commanded).sum(-1)) == pytest.approx(
         np.ones((4, 22)), abs=1e-5
