@@ -253,13 +253,15 @@ def build_rig(
     young_modulus: float = 1e5,
     colliders: Sequence[Collider] = (),
     keeps_volume: bool = False,
+    alpha_of: Callable[[np.ndarray], np.ndarray] | None = None,
     **settings,
 ) -> Rig:
     """Build a standing avatar ``cells`` grid spacings tall.
 
     ``shapes`` are shape parameters by name, one set an environment; ``half_width`` is that of the domain [m];
     ``others`` is the number of particles before the avatar's, in a row in the domain's corner. ``colliders`` follow
-    the ``floor``. ``keeps_volume`` corrects the rest pose.
+    the ``floor``. ``keeps_volume`` corrects the rest pose. ``alpha_of`` returns the shape preservation of
+    particles by their rest positions.
     """
     asset = load_asset()
     dx = float(np.ptp(asset.vertices[:, 2])) / cells
@@ -294,7 +296,12 @@ def build_rig(
     points = BodyPoints(rest, mass, joints, *skinning, particles.bone, velocity_lag, correctives)
     avatar = Avatar(points, others, model)
     control = pose_control(PoseControlConfig(**{"free_motion": False} | settings), model)
-    controller = PoseController(avatar, points, control)
+    rates = None
+    if alpha_of is not None:
+        kinematic = settings.get("shape_preservation") == "kinematic"
+        alpha = alpha_of(rest[0]) / model.control_dt
+        rates = np.stack([alpha * (not kinematic), alpha * kinematic], axis=1)
+    controller = PoseController(avatar, points, control, rates)
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
     reset_graph, step_graph = LaunchGraph(device), LaunchGraph(device)
     avatar.record_reset(reset_graph, state, mask)

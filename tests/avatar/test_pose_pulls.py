@@ -84,12 +84,33 @@ def test_kinematic_shape_preservation_undoes_alpha_of_the_error_a_step(make_rig)
     assert rig.shape_error().max() == pytest.approx(before * (1.0 - 0.3 / 12) ** 36, rel=0.03)
 
 
-def test_the_pull_is_given_back_bone_by_bone(make_rig, wild_pose):
+@pytest.mark.parametrize("decoupling", ["no_stress", "paper"])
+def test_flesh_with_a_rate_of_its_own_heals_by_it(make_rig, decoupling):
+    # In the kinematic velocity, each side of the belly as it is in a body that has its rate all over.
+    given = {"root": "free", "decoupling": decoupling, "num_substeps": 12, "shape_preservation": "kinematic"}
+    sides = make_rig(alpha=0.2, alpha_of=lambda rest: np.where(rest[:, 0] > 0.0, 0.5, 0.1), **given)
+    alike = {alpha: make_rig(alpha=alpha, **given) for alpha in (0.5, 0.1)}
+    left = sides.points.rest[0][:, 0] > 0.0
+    for rig in (sides, *alike.values()):
+        bulge(rig)
+        if decoupling == "paper":
+            rig.run_part_of_step("inject_velocity", 1)
+        else:
+            rig.run_controller()
+    change = {alpha: alike[alpha].read("vk") for alpha in alike}
+    assert np.abs(change[0.5] - change[0.1]).max() > 0.05
+    expected = np.where(left[:, None], change[0.5], change[0.1])
+    np.testing.assert_allclose(sides.read("vk"), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_the_pull_is_given_back_bone_by_bone(make_rig, wild_pose, own):
     # The velocity after the pull, against the formula in double precision. ``u += dl - fit_b(dl)`` with the implicit
     # critically damped change ``dl`` of ``u - u_b``, the decay of motion between bones, and the rigid part of it all
     # returned to the whole body.
     rng = np.random.default_rng(1)
-    rig = make_rig(root="free", tone=0.0, alpha=0.6).reset(wild_pose(rng), root=(0.0, 0.0, 0.9))
+    given = {"alpha": 0.0, "alpha_of": lambda rest: 0.2 + 0.5 * (rest[:, 0] > 0.05)} if own else {"alpha": 0.6}
+    rig = make_rig(root="free", tone=0.0, **given).reset(wild_pose(rng), root=(0.0, 0.0, 0.9))
     x, (count, dt) = rig.read("x"), (rig.points.num_points, rig.model.step.dt)
     place = x.copy()  # as tracked: only flesh is moved
     x = x + 0.02 * rng.normal(size=(count, 3)) * (rig.points.bone < 0)[:, None]
@@ -97,7 +118,8 @@ def test_the_pull_is_given_back_bone_by_bone(make_rig, wild_pose):
     rig.state.x.assign(x[None].astype(np.float32))
     rig.state.u.assign(u[None].astype(np.float32))
     rig.run_controller()
-    mass, weights, rate = rig.mass, rig.weights, 0.6 * 30.0
+    mass, weights = rig.mass, rig.weights
+    rate = 30.0 * (given["alpha_of"](rig.points.rest[0]) if own else np.full(count, 0.6))[:, None]
     u_bone = blended_rigid_part(weights, mass, x, u)
     relative = u - u_bone
     pull = (relative + dt * rate**2 * (place - x)) / (1.0 + 2.0 * rate * dt + (rate * dt) ** 2) - relative

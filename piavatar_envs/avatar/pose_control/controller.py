@@ -50,13 +50,17 @@ class PoseController:
     #: The end of a control step only takes over the command.
     moves_particles = False
 
-    def __init__(self, avatar: Avatar, points: BodyPoints, parameters: PoseControl) -> None:
+    def __init__(
+        self, avatar: Avatar, points: BodyPoints, parameters: PoseControl, shape_rates: np.ndarray | None = None
+    ) -> None:
         """Allocate the arrays of a substep.
 
         Args:
             avatar: the avatar.
             points: the body that it was built from.
             parameters: of the pulls and the root.
+            shape_rates: physical and kinematic shape preservation of every particle [1/s], shape ``(P, 2)``; those of
+                the parameters if there are no rows.
         """
         self.avatar, self.parameters, model = avatar, parameters, avatar.model
         self.in_one_launch = wp.get_device(model.device).is_cpu
@@ -94,6 +98,8 @@ class PoseController:
             jump=held * avatar.num_points,
             jumps=held * chunks,
         )
+        rates = np.zeros((0, 2)) if shape_rates is None else shape_rates
+        self._shape_rates = wp.array(rates, dtype=wp.vec2, device=model.device)
         self.motion = wp.zeros((n, avatar.num_points), dtype=wp.vec3, device=model.device)
         w = self.workspace
         swapped = {name: getattr(w, name) for name in PoseWorkspace.vars} | {"now": w.after, "after": w.now}
@@ -135,7 +141,8 @@ class PoseController:
                 self._record_injection(graph, state)
         elif self.in_one_launch:
             avatar, particles = self.avatar, self.avatar.model.particles
-            inputs = [avatar.body, self.parameters, particles, avatar.body_mass, step, state.x, state.failure]
+            own = [avatar.body, self.parameters, self._shape_rates]
+            inputs = [*own, particles, avatar.body_mass, step, state.x, state.failure]
             outputs = [self._workspaces[step % 2], self._root, self.motion, state.u, state.kinematic]
             graph.launch(command_body, avatar.model.num_envs, inputs, outputs)
         else:
@@ -159,7 +166,8 @@ class PoseController:
         inputs = [body, parameters, avatar.body_mass, step, self._chunk_threads, failure]
         graph.launch(prepare_body, (n, block), inputs, [w, root], block_dim=block)
 
-        inputs = [body, parameters, state.x, w.record, w.load, w.bones, released, step / model.num_substeps, failure]
+        inputs = [body, parameters, self._shape_rates, state.x, w.record, w.load, w.bones, released]
+        inputs += [step / model.num_substeps, failure]
         outputs = [state.u, self.motion, state.kinematic, w.pull, w.lean, w.jump]
         graph.launch(command_particles, points, inputs, outputs, block_dim=BLOCK)
         if parameters.free_motion or parameters.root_rate > 0.0:  # a released root leaves an unsupported body
@@ -182,7 +190,7 @@ class PoseController:
         avatar.record_pose(graph, 1.0, self._start, (w.increment, w.root_increment), w.after)
         inputs = [avatar.body, avatar.model.control_dt, w.now, w.after, w.carry]
         graph.launch(bone_matrices, (n, NUM_JOINTS), inputs, [self._bone_from, self._bone_step])
-        inputs = [avatar.body, self.parameters.kinematic_shape_rate, state.x, self._bone_from, self._bone_step]
+        inputs = [avatar.body, self.parameters, self._shape_rates, state.x, self._bone_from, self._bone_step]
         graph.launch(inject_velocity, (n, avatar.num_points), [*inputs, state.failure], [state.u, state.vk])
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:

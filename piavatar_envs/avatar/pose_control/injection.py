@@ -9,9 +9,10 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.pose_control.bones import carried_bone
+from piavatar_envs.avatar.pose_control.kernels import rates_of_shape
 from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.skinning import skinned_place
-from piavatar_envs.avatar.types import Body, Carry, Pose
+from piavatar_envs.avatar.types import Body, Carry, Pose, PoseControl
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -41,7 +42,8 @@ def bone_matrices(
 @wp.kernel
 def inject_velocity(
     body: Body,
-    kinematic_shape_rate: float,
+    control: PoseControl,
+    shape_rates: wp.array(dtype=wp.vec2),
     x: wp.array2d(dtype=wp.vec3),
     bone_from: wp.array2d(dtype=wp.mat44),
     bone_step: wp.array2d(dtype=wp.mat44),
@@ -55,7 +57,7 @@ def inject_velocity(
     if failure[e] != 0:
         return
     displacement = x[e, body.first + p] - skinned_place(body, bone_from, 0.0, e, p)
-    k = skinned_place(body, bone_step, 0.0, e, p) - kinematic_shape_rate * displacement
+    k = skinned_place(body, bone_step, 0.0, e, p) - rates_of_shape(control, shape_rates, p)[1] * displacement
     share = 1.0 - body.velocity_lag[row(e, body.velocity_lag.shape[0]), p]
     u[e, body.first + p] = u[e, body.first + p] + share * (k - vk[e, body.first + p])
     vk[e, body.first + p] = k

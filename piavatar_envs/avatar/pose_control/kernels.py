@@ -90,6 +90,7 @@ def warps_of_body(device: str, bodies: int) -> int:
 def command_body(
     body: Body,
     control: PoseControl,
+    shape_rates: wp.array(dtype=wp.vec2),
     particles: Particles,
     body_mass: wp.array(dtype=float),
     step: int,
@@ -123,8 +124,8 @@ def command_body(
         at = vector_at(x, e, body.first + p)
         before = vector_at(u, e, body.first + p)
         command_particle(
-            body, control, at, before, w.record, w.load, center, released, elapsed, e, p, u, motion, kinematic, w.pull,
-            w.lean, w.jump,
+            body, control, shape_rates, at, before, w.record, w.load, center, released, elapsed, e, p, u, motion,
+            kinematic, w.pull, w.lean, w.jump,
         )  # fmt: skip
     if free:
         for c in range(chunks):
@@ -255,9 +256,18 @@ def prepare_body(
 
 
 @wp.func
+def rates_of_shape(control: PoseControl, shape_rates: wp.array(dtype=wp.vec2), p: int):
+    """Return a particle's rates of physical and of kinematic shape preservation [1/s], its own if there are such."""
+    if shape_rates.shape[0] > 0:
+        return shape_rates[p]
+    return wp.vec2(control.shape_rate, control.kinematic_shape_rate)
+
+
+@wp.func
 def command_particle(
     body: Body,
     control: PoseControl,
+    shape_rates: wp.array(dtype=wp.vec2),
     at: wp.vec3,
     before: wp.vec3,
     record: wp.array2d(dtype=vec44),
@@ -294,9 +304,10 @@ def command_particle(
     turn = blended_turn(s)
     k = blended_vector(s, AT_STEP) + turn * displacement
     # the paper's shape preservation is part of the prescribed velocity
-    k -= control.kinematic_shape_rate * displacement
+    rates = rates_of_shape(control, shape_rates, p)
+    k -= rates[1] * displacement
     relative = before - blended_velocity(s, at - center)
-    pulled = implicit_velocity(control.shape_rate, control.dt, -displacement, relative) - relative
+    pulled = implicit_velocity(rates[0], control.dt, -displacement, relative) - relative
     way = blended_vector(s, AT_LEAN)
     change = wp.vec3()
     if control.root_rate > 0.0:
@@ -321,6 +332,7 @@ def command_particle(
 def command_particles(
     body: Body,
     control: PoseControl,
+    shape_rates: wp.array(dtype=wp.vec2),
     x: wp.array2d(dtype=wp.vec3),
     record: wp.array2d(dtype=vec44),
     load: wp.array(dtype=float),
@@ -358,8 +370,9 @@ def command_particles(
         following = vector_at(x, e, body.first + n)
         following_u = vector_at(u, e, body.first + n)
         command_particle(
-            body, control, at, before, record, load, center, gone, elapsed, e, p, u, motion, kinematic, pull, lean, jump
-        )
+            body, control, shape_rates, at, before, record, load, center, gone, elapsed, e, p, u, motion, kinematic,
+            pull, lean, jump,
+        )  # fmt: skip
         p += threads
 
 
