@@ -17,6 +17,7 @@ from piavatar_envs.avatar.body import sources
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.character import Character
 from piavatar_envs.avatar.body.closed_skin import read_soup
+from piavatar_envs.avatar.body.groups import skin_shares
 from piavatar_envs.avatar.body.rigs import read_mapping
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS
 from piavatar_envs.avatar.gltf import Gltf, read_gltf
@@ -185,6 +186,8 @@ def _body(asset: AvatarAsset) -> Report:
     }
     if asset.skeleton is not None:
         report["skeleton"] = f"{len(asset.skeleton.points)} points"
+    if asset.groups:
+        report["groups"] = [f"{name}: {share:.1%} of the skin" for name, share in skin_shares(asset).items()]
     if asset.shape_names:
         report["shape parameters"] = ", ".join(asset.shape_names)
     return report

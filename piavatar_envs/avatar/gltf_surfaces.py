@@ -19,6 +19,7 @@ from piavatar_envs.core.reading import UNREADABLE, reading
 MAX_VERTICES, MAX_TRIANGLES = 6_000_000, 6_000_000
 MAX_PIXELS = 2**26  # of a texture
 TEXTURE_SIDE = 1024  # [pixels] to which larger textures are averaged down
+MOST_GROUPS = 256  # that are painted
 MAX_SETS = 4  # of JOINTS_n and WEIGHTS_n
 SAME_PLACE = 5e-3  # of the size of a skeleton, within which skins agree on a joint
 _SIMPLIFY = "simplify it with: npx @gltf-transform/cli simplify IN.glb OUT.glb"
@@ -39,6 +40,7 @@ class Piece:
         nodes: that move each vertex, shape ``(V, K)`` int64.
         weights: their weights, rows sum to one, shape ``(V, K)`` float64.
         colors: sRGB, shape ``(V, 3)`` uint8.
+        painted: weights in [0, 1] by lower-case name, each shape ``(V,)`` float64.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Piece:
     nodes: np.ndarray
     weights: np.ndarray
     colors: np.ndarray
+    painted: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +231,22 @@ class _Reader:
         material = {} if number is None else self.gltf.item("materials", number)
         colors = self.colors(material, attributes, used, len(points), what)
         label = str(material.get("name", ""))[:200]
-        return Piece(name, index, skin, label, points[used].astype(np.float64), faces, nodes, weights, colors)
+        painted = self.painted(attributes, used, len(points))
+        return Piece(name, index, skin, label, points[used].astype(np.float64), faces, nodes, weights, colors, painted)
+
+    def painted(self, attributes: dict[str, Any], used: np.ndarray, count: int) -> dict[str, np.ndarray]:
+        """Return scalar attributes of the file's author, of which the names begin with ``_``, with values in [0, 1]."""
+        found = {}
+        for name in [name for name in attributes if name.startswith("_")][:MOST_GROUPS]:
+            try:
+                scalar = self.gltf.item("accessors", attributes[name]).get("type") == "SCALAR"
+                values = self.gltf.accessor(attributes[name]) if scalar else np.zeros((0, 1))
+            except ValueError as error:
+                self.notes.append(f"vertex attribute {name[:200]} is left out: {error}")
+                continue
+            if values.shape == (count, 1) and ((values >= 0.0) & (values <= 1.0)).all():
+                found[name.lstrip("_").lower()] = values[used, 0].astype(np.float64)
+        return found
 
     def triangles(self, primitive: dict[str, Any], count: int, what: str) -> np.ndarray:
         """Return the triangles of a primitive, of a list, a strip or a fan; shape ``(T, 3)`` int64."""

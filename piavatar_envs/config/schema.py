@@ -439,13 +439,19 @@ def _settings_of(section: type[BaseModel]) -> AfterValidator:
 
 
 class RegionConfig(BaseModel):
-    """Flesh of another material about some joints or below some surfaces, such as hair, a garment or a stiff boot."""
+    """Flesh of another material, such as hair or a boot: of some joints, of a group of the file, or of both."""
 
     model_config = FROZEN
 
     joints: tuple[JointName, ...] = Field((), description="names of the joints whose flesh it is; empty for all")
-    surfaces: tuple[str, ...] = Field(
-        (), description="names of materials of the avatar's file below which it lies; empty for all"
+    group: str | None = Field(
+        None,
+        min_length=1,
+        description="mesh, material or painted group of the body's file, below which the flesh lies, see "
+        "docs/avatars.md; null for all of the body",
+    )
+    depth: float | None = Field(
+        None, gt=0.0, le=FARTHEST, description="greatest distance of the flesh from the skin; null for any [m]"
     )
     beyond: float = Field(
         0.0, ge=0.0, le=FARTHEST, description="least distance of the flesh from the nearest bone particle [m]"
@@ -471,12 +477,20 @@ class RegionConfig(BaseModel):
         description="share of a change of commanded motion that its flesh misses, under pose control; null as the rest "
         "[-]",
     )
+    alpha: float | None = Field(
+        None, ge=0.0, le=1.0, description="shape preservation under pose control; null as the rest [-]"
+    )
+    flesh_rate: RateRange | None = Field(
+        None,
+        description="rates of the pulls to the bones under pd and torque, at the skin and at the bone; null as the "
+        "rest [1/s]",
+    )
 
     @model_validator(mode="after")
     def _check_place(self) -> RegionConfig:
-        """Refuse a region of the whole body."""
-        if not self.joints and not self.surfaces:
-            raise ConfigError("joints and surfaces are both empty; name some of either")
+        """Refuse a region of no particular place."""
+        if not self.joints and self.group is None:
+            raise ConfigError("neither joints nor a group are given; name joints, or a group of the file")
         return self
 
 
@@ -671,7 +685,7 @@ class EnvConfig(BaseModel):
 
     @model_validator(mode="after")
     def _check_avatars(self) -> EnvConfig:
-        """Refuse an avatar's settings of another mode than the environment's."""
+        """Refuse an avatar's settings of another mode than the environment's; regions may have those of both."""
         for index, avatar in enumerate(self.scene.avatars):
             _check_control(self.control.mode, avatar.control, f"scene.avatars.{index}.")
             if self.control.mode != "pose" and any(region.soft_tissue is not None for region in avatar.regions):
@@ -679,6 +693,13 @@ class EnvConfig(BaseModel):
                     f"scene.avatars.{index}.regions: soft_tissue belongs to control.mode='pose', and has no effect "
                     f"under {self.control.mode!r}; leave it out"
                 )
+            for number, region in enumerate(avatar.regions):
+                name, other = ("flesh_rate", "alpha") if self.control.mode == "pose" else ("alpha", "flesh_rate")
+                if getattr(region, name) is not None and getattr(region, other) is None:
+                    raise ConfigError(
+                        f"scene.avatars.{index}.regions.{number}.{name}={getattr(region, name)} has no effect under "
+                        f"control.mode={self.control.mode!r}; give {other}, with it or alone"
+                    )
         return self
 
     @model_validator(mode="after")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -19,6 +18,7 @@ from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
 from piavatar_envs.avatar.body.flesh_stiffness import flesh_stiffness
+from piavatar_envs.avatar.body.groups import flesh_of
 from piavatar_envs.avatar.body.muscles import make_muscles
 from piavatar_envs.avatar.body.pose_correctives import COARSEST, pose_correctives
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
@@ -89,8 +89,7 @@ class Flesh:
         self.avatar, self.asset, self.sampled, self.num_envs = avatar, asset, sampled, num_envs
         self.base_parameters = shape_parameters(asset, self.shape)
         self._shape_parameters = np.tile(self.base_parameters, (num_envs, 1))
-        for region in avatar.regions:
-            self.in_region(region)
+        self._regions = [self.in_region(region) for region in avatar.regions]
         self.part = body_part_of_joint()[sampled.skin_joints[:, 0]].astype(np.int32)
         self._correctives = pose_correctives(asset, sampled) if self.keeps_volume else None
         self._points, self._volume = self.shaped(self.base_parameters)
@@ -217,10 +216,15 @@ class Flesh:
         )
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)
+        rates = attachment_rates(sampled.depth, distance, firm, *control.flesh_rate)
+        for region, inside in zip(self.avatar.regions, self._regions, strict=True):
+            if region.flesh_rate is not None:
+                own = attachment_rates(sampled.depth, distance, np.zeros(len(sampled)), *region.flesh_rate)
+                rates = np.where(inside, own, rates)
         return TorqueControl(
             muscles=make_muscles(control.joint_stiffness, control.joint_damping, control.strength),
             root_assist=control.root_assist,
-            flesh_rate=attachment_rates(sampled.depth, distance, firm, *control.flesh_rate),
+            flesh_rate=rates,
             firm_bones=(sampled.bone >= 0) & control.firm_bones,
             links=sampled.links,
             bone_contact=control.bone_contact,
@@ -271,46 +275,52 @@ class Flesh:
     def _region_values(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return ``values`` with those of the regions of other material written into them, shape ``(P,)``."""
         values = values.copy()
-        for region in self.avatar.regions:
+        for region, inside in zip(self.avatar.regions, self._regions, strict=True):
             value = getattr(region, name)
             if value is not None:
-                values[self.in_region(region)] = material_index(value) if name == "material" else value
+                values[inside] = material_index(value) if name == "material" else value
         return values
 
     def in_region(self, region: RegionConfig) -> np.ndarray:
         """Return the mask of a region's particles, shape ``(P,)`` bool.
 
         Raises:
-            ConfigError: the region has no particles, or the avatar has no surface of such a name.
+            ConfigError: the region has no particles, or the file has no such group.
         """
-        sampled, inside = self.sampled, np.ones(len(self.sampled), bool)
+        sampled = self.sampled
+        inside = np.ones(len(sampled), bool)
         if region.joints:
             inside &= np.isin(sampled.skin_joints[:, 0], [joint_index(name) for name in region.joints])
-        if region.surfaces:
-            inside &= self._below(region.surfaces)
+        if region.group is not None:
+            try:
+                inside &= flesh_of(self.asset, sampled, region.group)
+            except ValueError as error:
+                raise ConfigError(f"scene.avatars: {error}") from None
         if region.beyond > 0.0:
             inside &= bone_distance(sampled.rest_positions, sampled.bone) > region.beyond
+        if region.depth is not None:
+            inside &= sampled.depth <= region.depth
         if not inside.any():
+            what = [] if region.group is None else [f"group {region.group!r}"]
+            what += [str(list(region.joints))] if region.joints else []
+            where = [] if region.depth is None else [f"within depth={region.depth} m of the skin"]
+            where += [f"beyond={region.beyond} m from the bones"] if region.beyond > 0.0 else []
             raise ConfigError(
-                f"scene.avatars: no flesh of {[*region.joints, *region.surfaces]} is beyond={region.beyond} m from the "
-                "bones; use less, or name more"
+                f"scene.avatars: no particle of {' and '.join(what + where)}; use other joints, a greater depth, less "
+                f"beyond or a finer body: its particles are {1e3 * sampled.spacing:.0f} mm apart"
             )
         return inside
 
-    def _below(self, surfaces: Sequence[str]) -> np.ndarray:
-        """Return the mask of the particles whose nearest point of the skin is on some surfaces, shape ``(P,)`` bool.
+    def shape_rates(self, model: Model) -> np.ndarray:
+        """Return rates of physical and of kinematic shape preservation [1/s], ``(P, 2)``; no rows if all are alike.
 
-        Raises:
-            ConfigError: the avatar has no surface of such a name.
+        That is the form that :class:`~piavatar_envs.avatar.pose_control.controller.PoseController` takes.
         """
-        names = self.asset.surface_names
-        unknown = [name for name in surfaces if name not in names]
-        if unknown:
-            there = f"there are {', '.join(names)}" if names else "this avatar has none with names"
-            raise ConfigError(f"scene.avatars: no surface {unknown[0]!r}; {there}")
-        nearest = self.sampled.anchor_weights.argmax(axis=1)[:, None]
-        corner = np.take_along_axis(self.sampled.anchor_vertices, nearest, axis=1)[:, 0]
-        return np.isin(self.asset.surfaces[corner], [names.index(name) for name in surfaces])
+        alpha = self._region_values("alpha", np.full(len(self.sampled), self.control.alpha))
+        if (alpha == self.control.alpha).all():
+            return np.zeros((0, 2), np.float32)
+        kinds = np.array([self.control.shape_preservation == kind for kind in ("physical", "kinematic")])
+        return (alpha[:, None] / model.control_dt * kinds).astype(np.float32)
 
 
 def pose_control(settings: PoseControlConfig, model: Model) -> PoseControl:

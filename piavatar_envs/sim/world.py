@@ -201,7 +201,9 @@ class Simulation:
         self.controllers: list[Controller] = [
             TorqueController(avatar, flesh.points, torque)
             if torque
-            else PoseController(avatar, flesh.points, pose_control(flesh.control, self.model))
+            else PoseController(
+                avatar, flesh.points, pose_control(flesh.control, self.model), flesh.shape_rates(self.model)
+            )
             for avatar, flesh, torque in zip(self.avatars, self.flesh, self._torque, strict=True)
         ]
 

@@ -84,6 +84,18 @@ def glb(document: bytes, blob: bytes) -> bytes:
 
 
 @dataclass
+class Part:
+    """Another skinned mesh of a test character, in our axes and metres."""
+
+    name: str
+    material: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    weights: np.ndarray
+    attributes: dict[str, tuple[np.ndarray, str]] = field(default_factory=dict)
+
+
+@dataclass
 class Rig:
     """Rig and mesh of a test character, in our axes and metres, and how its file has them.
 
@@ -103,6 +115,7 @@ class Rig:
         weight_type: of the weights.
         material: of the skin.
         attributes: more of the skin, by name: array and accessor type.
+        parts: further meshes on the same bones, floats in a file of default axes and unit.
     """
 
     names: Sequence[str]
@@ -120,6 +133,7 @@ class Rig:
     weight_type: str = "f4"
     material: dict[str, Any] | None = None
     attributes: dict[str, tuple[np.ndarray, str]] = field(default_factory=dict)
+    parts: Sequence[Part] = ()
 
     def write(self) -> Writer:
         """Return the document: the armature is node 0, bones follow, the skin is the last node."""
@@ -184,7 +198,20 @@ class Rig:
         out.add("skins", skin)
         out.add("meshes", {"name": "Body", "primitives": [primitive]})
         node = out.add("nodes", {"name": "Body", "mesh": 0, "skin": 0})
-        out.document |= {"scene": 0, "scenes": [{"nodes": [0, node]}]}
+        nodes = [0, node]
+        for part in self.parts:
+            bones, weights = top_weights(part.weights)
+            attributes = {
+                "POSITION": out.accessor((part.vertices @ self.axes.T).astype("<f4"), "VEC3"),
+                "JOINTS_0": out.accessor(bones.astype("<u1"), "VEC4"),
+                "WEIGHTS_0": out.accessor(weights.astype("<f4"), "VEC4"),
+                **{name: out.accessor(array, kind) for name, (array, kind) in part.attributes.items()},
+            }
+            primitive = {"attributes": attributes, "indices": out.accessor(part.faces.astype("<u4").ravel(), "SCALAR")}
+            primitive["material"] = out.add("materials", {"name": part.material})
+            mesh = out.add("meshes", {"name": part.name, "primitives": [primitive]})
+            nodes.append(out.add("nodes", {"name": part.name, "mesh": mesh, "skin": 0}))
+        out.document |= {"scene": 0, "scenes": [{"nodes": nodes}]}
         return out
 
 

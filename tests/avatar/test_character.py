@@ -122,22 +122,22 @@ def test_flesh_below_a_surface_of_the_file_is_of_another_material(character, dev
     faces = np.concatenate([character.faces[~boots], character.faces[boots]])
     surfaces = (Surface("body", 0, (~boots).sum(), "Skin"), Surface("boots", (~boots).sum(), len(faces), "Leather"))
     booted = body_of(dataclasses.replace(character, faces=faces, surfaces=surfaces))
-    assert booted.surface_names == ("Skin", "Leather")
+    assert set(booted.groups) == {"body", "Skin", "boots", "Leather"}
     piavatar_envs.register_source("booted", lambda: booted)
 
     def world(**region):
         avatars = [{"avatar": {"source": "booted"}, "regions": [{"young_modulus": 5.0e5, **region}]}]
         return Simulation(load_config(EnvConfig, None, {"fidelity": "tiny", "scene.avatars": avatars}), 1, device)
 
-    simulation = world(surfaces=["Leather"])
+    simulation = world(group="Leather")
     stiff = simulation.model.particles.mu.numpy()[0] * 2.6 > 4.0e5
     height = simulation.flesh[0].sampled.rest_positions[:, 2] - booted.vertices[:, 2].min()
     assert stiff[height < 0.08].all() and not stiff[height > 0.16].any()
-    left = world(surfaces=["Leather"], joints=["left_ankle"]).model.particles.mu.numpy()[0] * 2.6 > 4.0e5
+    left = world(group="Leather", joints=["left_ankle"]).model.particles.mu.numpy()[0] * 2.6 > 4.0e5
     assert 0 < left.sum() < stiff.sum() and stiff[left].all()
-    with pytest.raises(ConfigError, match=r"no surface 'Silk'; there are Skin, Leather"):
-        world(surfaces=["Silk"])
-    with pytest.raises(ConfigError, match=r"scene\.avatars\.0\.regions\.0.*joints and surfaces are both empty"):
+    with pytest.raises(ConfigError, match=r"no group 'Silk' on its skin; it has body, Skin, boots, Leather"):
+        world(group="Silk")
+    with pytest.raises(ConfigError, match=r"scene\.avatars\.0\.regions\.0.*neither joints nor a group"):
         world()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -139,6 +141,17 @@ def test_displacements_by_the_pose_are_the_model_s(members, asset):
 def test_settings_that_the_file_does_not_carry_are_refused(path, settings, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         load_asset("smplx", path=path, **settings)
+
+
+def test_groups_of_vertices_come_to_the_skin(members, path, tmp_path):
+    most = members["weights"].argmax(axis=1)
+    listed = {"left_hip": np.flatnonzero(most == 1).tolist(), "nothing": []}
+    file = tmp_path / "groups.json"
+    file.write_text(json.dumps(listed))
+    body = load_asset("smplx", path=path, groups=str(file))
+    assert set(body.groups) == {"skin", "left_hip"}
+    inside = body.groups["left_hip"] > 0.5
+    assert inside.sum() > 50 and (body.skin_joints[inside, 0] == joint_index("left_hip")).mean() > 0.95
 
 
 def test_open_eyes_are_closed_and_the_face_moves(tmp_path):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -109,9 +109,8 @@ class AvatarAsset:
         shape_deltas: vertex displacements at -1 and at +1 of each parameter [m], shape ``(S, 2, V, 3)`` float32.
         shape_joints: joint displacements, the same way [m], shape ``(S, 2, 22, 3)`` float32.
         look: the surface to draw; None draws the skin.
-        surface_names: names of the parts of the skin, such as materials of a file.
-        surfaces: the part that each vertex belongs to, an index into ``surface_names``, shape ``(V,)`` int32.
         skeleton: where bone particles are put; None puts them around the bones' axes.
+        groups: weights in [0, 1] of the vertices in groups that the file names, each shape ``(V,)`` float32.
     """
 
     name: str
@@ -124,9 +123,8 @@ class AvatarAsset:
     shape_deltas: np.ndarray
     shape_joints: np.ndarray
     look: Look | None = None
-    surface_names: tuple[str, ...] = ()
-    surfaces: np.ndarray | None = None
     skeleton: SkeletonPoints | None = None
+    groups: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def shape(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
         """Return the body of shape parameters ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.

@@ -7,9 +7,8 @@ this package rests, closes its skin, and keeps its own surfaces as the look of t
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import sparse
@@ -17,6 +16,7 @@ from scipy import sparse
 from piavatar_envs.avatar.body import closed_skin, sampling
 from piavatar_envs.avatar.body.asset import AvatarAsset, Look, PoseDisplacements, top_weights
 from piavatar_envs.avatar.body.closed_skin import CELL, ClosedSkin, close_skin, distinct, read_soup, unique_rows
+from piavatar_envs.avatar.body.groups import on_skin
 from piavatar_envs.avatar.body.rigs import spread_weights
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.body.skeleton_mesh import moved, read_skeleton
@@ -69,6 +69,7 @@ class Character:
         pose: displacements of the vertices that depend on the pose, for the look; only of a character that rests in
             the reference pose already.
         placement: matrix ``(3, 3)`` and origin ``(3,)`` [m] of our coordinates: ``vertex = matrix file - origin``.
+        groups: weights in [0, 1] of the vertices in painted groups, each shape ``(V,)``.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Character:
     notes: tuple[str, ...] = ()
     pose: PoseDisplacements | None = None
     placement: tuple[np.ndarray, np.ndarray] | None = None
+    groups: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def held(self) -> np.ndarray:
@@ -123,21 +125,8 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
         shape_deltas=deltas,
         shape_joints=np.asarray(posed.shape_joints, np.float32).reshape(count, 2, NUM_JOINTS, 3),
         look=_look(posed, flipped, part),
-        **_named_surfaces(character, skin.anchors),
+        groups=on_skin({**_named(posed), **posed.groups}, skin.anchors),
     )
-
-
-def _named_surfaces(character: Character, anchors: sparse.csr_array) -> dict[str, Any]:
-    """Return the parts of the skin by the materials of the surfaces beneath it, by their own names without one."""
-    names = tuple(dict.fromkeys(surface.material or surface.name for surface in character.surfaces))
-    if not names:
-        return {}
-    share = np.zeros((len(character.vertices), len(names)))
-    for surface in character.surfaces:
-        share[
-            np.unique(character.faces[surface.first : surface.last]), names.index(surface.material or surface.name)
-        ] = 1
-    return {"surface_names": names, "surfaces": (anchors @ share).argmax(axis=1).astype(np.int32)}
 
 
 def _closed(character: Character, posed: np.ndarray, cell: float) -> tuple[ClosedSkin, np.ndarray, np.ndarray]:
@@ -238,6 +227,17 @@ def _blend(weights: np.ndarray, matrix: np.ndarray, points: np.ndarray) -> np.nd
     """Apply linear blend skinning of all joints to points, shape ``(V, 3)`` float64."""
     blended = (weights @ matrix.reshape(NUM_JOINTS, 12)).reshape(-1, 3, 4)
     return np.einsum("vij,vj->vi", blended[:, :, :3], points) + blended[:, :, 3]
+
+
+def _named(character: Character) -> dict[str, np.ndarray]:
+    """Return the vertices of each surface and of each material by name, shape ``(V,)``; equal names are one group."""
+    groups: dict[str, np.ndarray] = {}
+    for surface in character.surfaces:
+        for name in (surface.name, surface.material):
+            if name:
+                own = character.faces[surface.first : surface.last]
+                groups.setdefault(name, np.zeros(len(character.vertices)))[own] = 1.0
+    return groups
 
 
 def _look(posed: Character, flipped: np.ndarray, part: np.ndarray) -> Look:

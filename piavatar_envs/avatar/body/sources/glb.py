@@ -104,6 +104,7 @@ def read_character(path: str | Path, height: float | None = None, mapping: str |
         shape_joints=np.zeros((0, 2, NUM_JOINTS, 3)),
         notes=tuple(notes),
         placement=(scale * axes, origin),
+        groups=_painted(surfaces, kept),
     )
 
 
@@ -198,6 +199,16 @@ def _weights(surfaces: Surfaces, index: int, owners: np.ndarray) -> np.ndarray:
     weights = np.zeros((len(piece.points), NUM_JOINTS))
     np.add.at(weights, (np.arange(len(weights))[:, None], owners[piece.nodes]), piece.weights)
     return weights
+
+
+def _painted(surfaces: Surfaces, kept: list[int]) -> dict[str, np.ndarray]:
+    """Return the painted groups of all pieces, each shape ``(V,)``; a piece without one is not in it."""
+    pieces = [surfaces.pieces[index] for index in kept]
+    names = dict.fromkeys(name for piece in pieces for name in piece.painted)
+    return {
+        name: np.concatenate([piece.painted.get(name, np.zeros(len(piece.points))) for piece in pieces])
+        for name in names
+    }
 
 
 def _foot_tips(joint_map: JointMap, rest: np.ndarray, places: np.ndarray, weights: np.ndarray) -> np.ndarray | None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from piavatar_envs.avatar.body.asset import SAMPLE_DEVIATION, AvatarAsset, PoseDisplacements
 from piavatar_envs.avatar.body.character import Character, Surface, body_of, reference_rotations
+from piavatar_envs.avatar.body.groups import read_groups
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
 from piavatar_envs.avatar.body.skeleton_mesh import moved, read_skeleton
 from piavatar_envs.avatar.body.smpl_file import SmplModel, read_smpl
@@ -36,6 +37,7 @@ def build(
     num_expressions: int | None = None,
     flat_hand: bool = False,
     skeleton: str | None = None,
+    groups: str | None = None,
 ) -> AvatarAsset:
     """Return the body of a model file.
 
@@ -47,6 +49,7 @@ def build(
         num_expressions: shape parameters ``expression_0`` and so on, likewise.
         flat_hand: hold the hands flat, as the template has them, and not in the file's mean pose.
         skeleton: mesh of a skeleton, or a folder of its parts, in the file's axes and zero pose; for bone particles.
+        groups: JSON file of an object from names to lists of vertices, as segmentations of these models are.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -55,6 +58,8 @@ def build(
     model, shaped, counts = _person(path, betas, expression, num_betas, num_expressions)
     rotations, reference = _reference(model, shaped, flat_hand)
     character = _character(path, model, shaped, counts, rotations, reference)
+    if groups is not None:
+        character = replace(character, groups=read_groups(groups, len(character.vertices)))
     bones = None
     if skeleton is not None:
         rest = model.joints(shaped)[:NUM_JOINTS] @ TO_OURS.T
