@@ -42,6 +42,10 @@ class ArrayApi(Protocol):
         """Check a caller's choice of environments, and convert it to a mask ``(num_envs,)`` bool."""
         ...
 
+    def shares(self, name: str, weights: Any, shape: tuple[int, int]) -> Array:
+        """Check a caller's weights, one row for all environments or one each, and sum their shares up: ``shape``."""
+        ...
+
     def write(self, values: Array, arrays: Sequence[wp.array]) -> None:
         """Write checked ``values`` into the arrays, row by row."""
         ...
@@ -125,6 +129,30 @@ def check_envs(envs: Any, num_envs: int) -> np.ndarray:
     return mask
 
 
+def check_weights(name: str, weights: Any, shape: tuple[int, int]) -> np.ndarray:
+    """Return weights as float64, ``(num_envs, count)`` or ``(1, count)`` for all environments.
+
+    Raises:
+        ValueError: no array of real numbers, a wrong shape, or weights that are negative, not finite or all zero.
+    """
+    count = shape[1]
+    shapes = f"use shape ({count},) or {shape}"
+    try:
+        rows = np.asarray(weights, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} is a {type(weights).__name__} ({error}); {shapes} of real numbers") from None
+    if rows.shape not in ((count,), shape):
+        raise ValueError(f"{name} has shape {rows.shape}; {shapes}")
+    bad = ~np.isfinite(rows) | (rows < 0.0)
+    if bad.any():
+        index = np.argwhere(bad)[0].tolist()
+        raise ValueError(f"{name}{index} is {rows[tuple(index)]}; it must be finite and >= 0")
+    rows = rows.reshape(-1, count)
+    if not rows.any(axis=1).all():
+        raise ValueError(f"{name} are all zero; give one of them a weight, or None to draw all alike")
+    return rows
+
+
 class NumpyArrays:
     """Arrays on the host, whatever the device."""
 
@@ -157,6 +185,18 @@ class NumpyArrays:
             ValueError: a wrong shape or type, or there is no such environment.
         """
         return check_envs(envs, num_envs)
+
+    def shares(self, name: str, weights: Any, shape: tuple[int, int]) -> np.ndarray:
+        """Convert weights to cumulative shares; zeros for None.
+
+        Raises:
+            ValueError: see :func:`check_weights`.
+        """
+        if weights is None:
+            return np.zeros(shape, np.float32)
+        rows = check_weights(name, weights, shape)
+        sums = (rows / rows.max(axis=1, keepdims=True)).cumsum(axis=1)
+        return np.broadcast_to((sums / sums[:, -1:]).astype(np.float32), shape)
 
     def write(self, values: np.ndarray, arrays: Sequence[wp.array]) -> None:
         """Write ``values`` into the arrays, row by row."""
@@ -301,6 +341,23 @@ class TorchArrays:
                 f"envs is a mask of shape {tuple(envs.shape)} on {envs.device}; use ({num_envs},) on {self.device}"
             )
         return envs
+
+    def shares(self, name: str, weights: Any, shape: tuple[int, int]) -> Any:
+        """Convert weights to cumulative shares on the device, zeros for None; the values of a tensor are not checked.
+
+        Raises:
+            ValueError: a wrong shape or device, or see :func:`check_weights`.
+        """
+        if weights is None:
+            return self._torch.zeros(shape, device=self.device)
+        if not isinstance(weights, self._torch.Tensor):
+            weights = self._torch.tensor(check_weights(name, weights, shape), device=self.device)
+        elif tuple(weights.shape) not in ((shape[1],), shape):
+            raise ValueError(f"{name} has shape {tuple(weights.shape)}; use ({shape[1]},) or {shape}")
+        elif weights.device != self.device:
+            raise ValueError(f"{name} is on {weights.device}, the environments are on {self.device}")
+        sums = weights.double().reshape(-1, shape[1]).cumsum(dim=1)
+        return (sums / sums[:, -1:]).float().expand(shape)
 
     def write(self, values: Any, arrays: Sequence[wp.array]) -> None:
         """Write ``values`` into the arrays, row by row."""

@@ -440,6 +440,18 @@ class EpisodeHost:
         for group, part in zip(self.groups, parts, strict=True):
             group.assist_root(part)
 
+    def weigh_motions(self, weights: Any) -> None:
+        """Set the weights by which episodes draw their motions; see :meth:`HostView.weigh_motions`.
+
+        Raises:
+            ValueError: weights that are refused; nothing has changed then.
+        """
+        names = self.task.motion_names
+        if not names:
+            raise ValueError(f"{type(self.task).__name__} draws no motions to be weighed; TrackMotion does")
+        shares = self.api.shares("weights", weights, (self.num_envs, len(names)))
+        self.api.write(shares, [group.task.motion_shares for group in self.groups])
+
     @_alone
     def apply_force(
         self,
@@ -634,6 +646,22 @@ class HostView:
             ValueError: it is out of range, of another shape, or the control is ``"pose"``.
         """
         self.host.assist_root(share)
+
+    def weigh_motions(self, weights: Any) -> None:
+        """Set the weights by which later episodes of TrackMotion draw their motions; they are part of the state.
+
+        Resets keep them. The motions and their order are ``task.motion_names`` of the host.
+
+        Args:
+            weights: of all motions, at least 0, shape ``(motions,)``, or of each environment, ``(num_envs, motions)``;
+                a motion is drawn with its share of their sum. None draws all with equal probability, as at first.
+
+        Raises:
+            ValueError: a task that draws no motions, a wrong shape, or weights that are negative, not finite or all
+                zero; nothing has changed then. The values of tensors are not checked on the host: where their sum is
+                not positive, all motions are drawn with equal probability.
+        """
+        self.host.weigh_motions(weights)
 
     def apply_force(
         self,

@@ -128,6 +128,10 @@ class SB3VecEnv(VecEnv):
         """
         self.vector.assist_root(share)
 
+    def weigh_motions(self, weights: Any) -> None:
+        """Set the weights by which episodes draw motions; see :meth:`piavatar_envs.api.host.HostView.weigh_motions`."""
+        self.vector.weigh_motions(weights)
+
     def apply_force(self, *args: Any, **kwargs: Any) -> None:
         """Let a force act on a bone or a prop; see :meth:`piavatar_envs.api.host.HostView.apply_force`."""
         self.vector.apply_force(*args, **kwargs)

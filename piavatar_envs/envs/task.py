@@ -131,6 +131,10 @@ class Task:
         config: the settings.
         joints: names of the joints that act.
         scene: avatars, props and colliders.
+        motion_names: of the motions of which an episode draws one. Empty in most tasks; one that names some has, after
+            :meth:`allocate`, the index of the drawn one as ``playing``, ``(num_envs,)`` int32, and the cumulative
+            probabilities by which it is drawn as ``motion_shares``, ``(num_envs, motions)`` float32; a row that ends in
+            zero is uniform.
     """
 
     Config: ClassVar[type[EnvConfig]] = EnvConfig
@@ -149,6 +153,7 @@ class Task:
     camera_position: tuple[float, float, float] = (1.75, -3.75, 1.62)
     camera_target: tuple[float, float, float] = (0.0, -0.04, 0.86)
     camera_follows: bool = True
+    motion_names: tuple[str, ...] = ()
 
     reward_names: ClassVar[tuple[str, ...]] = ()
     cost_names: ClassVar[tuple[str, ...]] = ()

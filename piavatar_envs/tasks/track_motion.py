@@ -94,11 +94,30 @@ def root_of(clip: Clip, body: Body, e: int, frame: int):
     return (height / clip.pelvis_height) * clip.root[frame]
 
 
+@wp.func
+def draw_motion(random: wp.uint32, shares: wp.array2d(dtype=float), e: int):
+    """Return a motion by the cumulative shares of all, where these are set; else any, with equal probability."""
+    count = shares.shape[1]
+    if not shares[e, count - 1] > 0.0:
+        return wp.randi(random, 0, count)
+    drawn = wp.randf(random) * shares[e, count - 1]
+    least = int(0)
+    most = int(count - 1)
+    while least < most:  # the first motion whose cumulative share exceeds the number
+        middle = (least + most) // 2
+        if shares[e, middle] > drawn:
+            most = middle
+        else:
+            least = middle + 1
+    return least
+
+
 @wp.kernel
 def draw_start(
     episodes: Episodes,
     clip: Clip,
     body: Body,
+    shares: wp.array2d(dtype=float),
     # out
     playing: wp.array(dtype=int),
     start: wp.array(dtype=int),
@@ -111,7 +130,7 @@ def draw_start(
     if not episodes.mask[e]:
         return
     of_motion = random_of(episodes, e, STREAM_TASK, 1)
-    motion = wp.randi(of_motion, 0, clip.starts.shape[0])
+    motion = draw_motion(of_motion, shares, e)
     random = random_of(episodes, e, STREAM_TASK, 0)
     entered = wp.randi(random, 0, clip.starts[motion])
     frame = clip.first[motion] + entered
@@ -253,6 +272,7 @@ def judge(
     clip_rotation: wp.array2d(dtype=wp.quat),
     clip_position: wp.array2d(dtype=wp.vec3),
     impulse: wp.array(dtype=wp.vec3),
+    playing: wp.array(dtype=int),
     action: wp.array3d(dtype=float),
     # in and out
     errors: wp.array3d(dtype=wp.vec3),
@@ -288,6 +308,7 @@ def judge(
     outcome.metrics[e, 0, TrackMotionTask.metrics.rotation_error_deg] = wp.degrees(angle)
     outcome.metrics[e, 0, TrackMotionTask.metrics.root_error] = wp.length(bones.position[e, 0] - clip_position[e, 0])
     outcome.metrics[e, 0, TrackMotionTask.metrics.impulse] = wp.length(impulse[e])
+    outcome.metrics[e, 0, TrackMotionTask.metrics.motion] = float(playing[e])
     outcome.success[e, 0] = distance <= clip.success_distance
     outcome.terminated[e, 0] = distance > clip.fail_distance
 
@@ -343,6 +364,7 @@ class TrackMotionTask(Task):
         Metric("rotation_error_deg", "deg", "mean angle between the joints' local rotations and the clip's"),
         Metric("root_error", "m", "distance of the pelvis from the clip's"),
         Metric("impulse", "N s", "impulse that struck the body in this step, 0 for none"),
+        Metric("motion", "-", "index of the clip that the episode follows, in the order of their names"),
     )
     state_arrays = (
         TaskArray("playing", int),
@@ -394,6 +416,7 @@ velocity. Files and folders of motions, their split and the figures that PHC rep
             self.frames = load_frames(entries, asset, parameters, mapping, config.loop, sampling)
         except (ValueError, FileNotFoundError) as error:
             raise ConfigError(f"motion: {error}") from None
+        self.motion_names = self.frames.names
 
     def drawn(self) -> tuple[Parameter, ...]:
         dt = self.config.physics.control_dt
@@ -443,13 +466,17 @@ velocity. Files and folders of motions, their split and the figures that PHC rep
         if isinstance(controller, TorqueController):  # torques could not reach the clip's speed at once
             controller.first = self.clip_rotation, self.clip_root
         self.bones = wp.array([joint_index(name) for name in STRUCK], dtype=int, device=device)
+        self.motion_shares = wp.zeros((env.num_envs, len(self.motion_names)), dtype=float, device=device)
+
+    def arrays(self) -> dict[str, wp.array]:
+        return {**super().arrays(), "motion_shares": self.motion_shares}
 
     def record_reset(self, env, graph) -> None:
         drive = env.simulation.avatar.state
         graph.launch(
             draw_start,
             (env.num_envs, NUM_JOINTS),
-            [env.episodes, self.clip, env.simulation.avatar.body],
+            [env.episodes, self.clip, env.simulation.avatar.body, self.motion_shares],
             [self.playing, self.start, self.origin, drive.command_rotation, drive.command_root],
         )
         graph.launch(draw_offset, env.num_envs, [env.episodes, self.interval], [self.offset])
@@ -505,8 +532,8 @@ velocity. Files and folders of motions, their split and the figures that PHC rep
 
     def record_outcome(self, env, graph) -> None:
         self._record_clip(env, graph)
-        inputs = [self.clip, env.bones[0], self.clip_rotation, self.clip_position, self.impulse, env.action]
-        graph.launch(judge, env.num_envs, inputs, [self.errors, env.outcome])
+        inputs = [self.clip, env.bones[0], self.clip_rotation, self.clip_position, self.impulse, self.playing]
+        graph.launch(judge, env.num_envs, [*inputs, env.action], [self.errors, env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_clip(env, graph)

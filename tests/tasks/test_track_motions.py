@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, collection, load_motion
 from piavatar_envs.avatar.motion.collection import (
@@ -21,14 +22,17 @@ from piavatar_envs.avatar.motion.collection import (
     place_in_split,
     sample_frames,
 )
-from piavatar_envs.config import ConfigError
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.core import result_cache
+from piavatar_envs.tasks import load_task
 from tests.avatar.skeletons import Skeleton, write_bvh
 from tests.tasks.measured import still
 
 TRACK = "PIAvatar/TrackMotion-v0"
 WALK_0 = 0.636576779487609  # on every machine
 DT = 1.0 / 30.0
+#: Motions of four that the seeds 7, 8, ... draw with equal probability.
+UNIFORM = [2, 3, 2, 2, 2, 1, 1, 1]
 
 
 @pytest.fixture(scope="module")
@@ -199,3 +203,68 @@ def test_no_motions_and_folders_without_a_slash_are_refused(make_batch, tmp_path
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"write '\./walks'"):
         make_batch(TRACK, 1, motion="walks")
+
+
+@pytest.fixture
+def make_host(device):
+    """Function that builds a host of four clips."""
+    task = load_task(TRACK)
+    settings = {"motion": ["idle", "kick", "squat", "step"], "fidelity": "tiny"}
+
+    def make(num_envs: int, **kwargs) -> EpisodeHost:
+        return EpisodeHost(task(load_config(task.Config, settings)), num_envs, device, **kwargs)
+
+    return make
+
+
+def drawn(host: EpisodeHost, seed: int | None = None) -> np.ndarray:
+    """Begin episodes, and return the motions that they follow."""
+    host.reset(seed)
+    return np.concatenate([group.task.playing.numpy() for group in host.groups])
+
+
+def test_weights_say_how_often_motions_are_drawn(make_host):
+    host = make_host(32)
+    uniform = drawn(host, 7)
+    assert np.array_equal(uniform[:8], UNIFORM)
+    host.weigh_motions([0.0, 3.0, 1.0, 0.0])
+    counts = np.bincount(np.concatenate([drawn(host) for _ in range(10)]), minlength=4)
+    assert counts[[0, 3]].sum() == 0 and counts[1] / 320 == pytest.approx(0.75, abs=4 * np.sqrt(0.75 * 0.25 / 320))
+    state, later = host.get_state(), [drawn(host) for _ in range(2)]
+    other = make_host(32, num_threads=1)
+    other.reset(0)
+    other.set_state(state)
+    assert np.array_equal([drawn(other) for _ in range(2)], later), "the weights are part of the state"
+    own = np.arange(32) % 4
+    host.weigh_motions(np.eye(4)[own])
+    assert np.array_equal(drawn(host), own)
+    host.step(np.zeros((32, 1, host.action_size), np.float32))
+    assert np.array_equal(host.read(lambda group: group.metrics)[:, 0, host.task.metric_names.index("motion")], own)
+    host.weigh_motions(None)
+    assert np.array_equal(drawn(host, 7), uniform)
+
+
+def test_weights_are_checked(make_host, make_env):
+    host = make_host(2)
+    host.weigh_motions([0.0, 0.0, 1.0, 0.0])
+    for weights, message in (
+        ([1.0, 2.0], r"shape \(2,\); use shape \(4,\) or \(2, 4\)"),
+        ([1.0, -2.0, 0.0, 0.0], r"weights\[1\] is -2"),
+        ([[1.0, 0.0, 0.0, np.nan], [1.0] * 4], r"weights\[0, 3\] is nan"),
+        (np.zeros((2, 4)), "all zero"),
+        ("kick", "use shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            host.weigh_motions(weights)
+    assert drawn(host, 0).tolist() == [2, 2]
+    with pytest.raises(ValueError, match="draws no motions"):
+        make_env("PIAvatar/Reach-v0").unwrapped.weigh_motions([1.0])
+
+
+def test_tensors_weigh_motions_on_their_device(make_host):
+    torch = pytest.importorskip("torch", reason="needs the extra train")
+    host = make_host(4, array_api="torch")
+    host.weigh_motions(torch.tensor([0.0, 0.0, 0.0, 2.0], device=host.api.device))
+    assert drawn(host, 7).tolist() == [3] * 4
+    host.weigh_motions(torch.zeros(4, device=host.api.device))  # without a share they are drawn alike
+    assert np.array_equal(drawn(host, 7), UNIFORM[:4])
