@@ -44,7 +44,7 @@ TRACKING = {
     "acceleration_error": ("acceleration_error_mm", 1.0),
 }
 #: Metrics of tasks that evaluations read.
-EVALUATED_METRICS = ("distance", "strongest_push", *TRACKING)
+EVALUATED_METRICS = ("distance", "strongest_push", "motion", *TRACKING)
 #: Seconds between two updates of the bar in a log.
 _LOG_SECONDS = 30.0
 
@@ -63,6 +63,7 @@ class Episode:
         distance: mean over the steps of the task's ``distance`` [m], where it has one.
         push: greatest impulse of a push [N s], where the task pushes, or None.
         tracking: means over the steps of the metrics in :data:`TRACKING`, where the task has them.
+        motion: index of the motion that it followed, where the task draws one, or None.
         failure: whether the simulation has failed.
         agent_totals: undiscounted return of every agent of a world, shape ``(agents,)``; None where there is one.
         agent_success: whether each had fulfilled its task in its last step, shape ``(agents,)``, or None.
@@ -77,6 +78,7 @@ class Episode:
     distance: float = 0.0
     push: float | None = None
     tracking: dict[str, float] = field(default_factory=dict)
+    motion: int | None = None
     failure: bool = False
     agent_totals: np.ndarray | None = None
     agent_success: np.ndarray | None = None
@@ -90,6 +92,8 @@ class Episode:
         self.successes += self.success_at_end
         self.distance += (float(info.get("distance", np.nan)) - self.distance) / self.steps
         self.push = info.get("strongest_push")
+        if "motion" in info:
+            self.motion = int(info["motion"])
         for name in TRACKING.keys() & info.keys():
             mean = self.tracking.get(name, 0.0)
             self.tracking[name] = mean + (float(info[name]) - mean) / self.steps
@@ -101,10 +105,17 @@ class Episode:
 
 @dataclass
 class Evaluation:
-    """An agent's episodes, by seed."""
+    """An agent's episodes, by seed.
+
+    Attributes:
+        agent: its name.
+        episodes: that it has played.
+        motions: names of the motions of which each episode follows one, where there are any.
+    """
 
     agent: str
     episodes: list[Episode] = field(default_factory=list)
+    motions: tuple[str, ...] = ()
 
     @property
     def returns(self) -> np.ndarray:
@@ -143,15 +154,40 @@ class Evaluation:
         if self.episodes[0].push is not None:
             row["by_push"] = by_push(self.episodes)
         if self.episodes[0].tracking:
-            kept = [not episode.terminated for episode in self.episodes]
-            row |= {"followed": float(np.mean(kept)), "followed_interval": share_interval(kept)}
-            for name, (key, factor) in TRACKING.items():
-                row[key] = factor * self.share(lambda e, name=name: e.tracking[name])
+            row |= tracking_of(self.episodes)
+        if len(self.motions) > 1:
+            row["by_motion"] = by_motion(self.episodes, self.motions)
         if self.episodes[0].agent_totals is not None:
             of_agents = [mean_and_interval(totals) for totals in np.transpose([e.agent_totals for e in self.episodes])]
             row["agent_return_mean"] = [one.mean for one in of_agents]
             row["agent_return_interval"] = [[one.low, one.high] for one in of_agents]
         return row
+
+
+def tracking_of(episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Return the share of episodes that were followed to the end, and means of the figures in :data:`TRACKING`."""
+    kept = [not episode.terminated for episode in episodes]
+    figures = {
+        key: factor * float(np.mean([episode.tracking[name] for episode in episodes]))
+        for name, (key, factor) in TRACKING.items()
+    }
+    return {"followed": float(np.mean(kept)), "followed_interval": share_interval(kept), **figures}
+
+
+def by_motion(episodes: Sequence[Episode], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the figures of :func:`tracking_of` by motion, the least followed first; one without episodes is left out.
+
+    Args:
+        episodes: of a task with several motions.
+        names: of all its motions.
+    """
+    groups: dict[int, list[Episode]] = {}
+    for episode in episodes:
+        groups.setdefault(episode.motion, []).append(episode)
+    rows = [
+        {"motion": names[motion], "episodes": len(own), **tracking_of(own)} for motion, own in sorted(groups.items())
+    ]
+    return sorted(rows, key=lambda row: (row["followed"], -row["g_mpjpe_mm"]))
 
 
 def by_push(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
@@ -210,9 +246,31 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         summed |= {"followed": float(np.mean(shares))}
         summed |= {"followed_interval": share_interval_over_seeds(shares, episodes)}
         summed |= {key: float(np.mean([row[key] for row in rows])) for key, _ in TRACKING.values()}
+    if all("by_motion" in row for row in rows):
+        summed["by_motion"] = _motions_over_seeds([row["by_motion"] for row in rows])
     if "by_push" in rows[0]:
         summed["by_push"] = _pooled([push for row in rows for push in row["by_push"]], len(rows))
     return summed | {"failures": sum(row["failures"] for row in rows)}
+
+
+def _motions_over_seeds(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Average rows of :func:`by_motion` of several trainings in the same episodes."""
+    of_motion: dict[str, list[Mapping[str, Any]]] = {}
+    for row in (row for table in tables for row in table):
+        of_motion.setdefault(row["motion"], []).append(row)
+    averaged = []
+    for name, rows in of_motion.items():
+        shares, episodes = [row["followed"] for row in rows], rows[0]["episodes"]
+        averaged.append(
+            {
+                "motion": name,
+                "episodes": episodes,
+                "followed": float(np.mean(shares)),
+                "followed_interval": share_interval_over_seeds(shares, episodes),
+                **{key: float(np.mean([row[key] for row in rows])) for key, _ in TRACKING.values()},
+            }
+        )
+    return sorted(averaged, key=lambda row: (row["followed"], -row["g_mpjpe_mm"]))
 
 
 def _pooled(pushes: Sequence[Mapping[str, Any]], seeds: int) -> list[dict[str, Any]]:
@@ -226,7 +284,13 @@ def _pooled(pushes: Sequence[Mapping[str, Any]], seeds: int) -> list[dict[str, A
 
 
 def evaluate(
-    name: str, agent: Agent, venv: VecEnv, episodes: int, first_seed: int, progress: bool = True
+    name: str,
+    agent: Agent,
+    venv: VecEnv,
+    episodes: int,
+    first_seed: int,
+    progress: bool = True,
+    motions: tuple[str, ...] = (),
 ) -> Evaluation:
     """Play episodes ``first_seed``, ``first_seed + 1``, ... to their ends.
 
@@ -240,6 +304,7 @@ def evaluate(
         episodes: how many episodes.
         first_seed: of the first.
         progress: whether to show a bar.
+        motions: names of the task's motions, if it has any.
     """
     played: list[Episode] = []
     with episode_bar(name, episodes, disable=None if progress else True) as bar:
@@ -248,7 +313,7 @@ def evaluate(
             counted = min(venv.num_envs, first_seed + episodes - first)
             played += _play_round(agent, venv, first)[:counted]
             bar.update(counted)
-    return Evaluation(name, played)
+    return Evaluation(name, played, motions)
 
 
 def episode_bar(name: str, episodes: int, **how: Any) -> tqdm:
@@ -310,7 +375,7 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
             # all go on at once, and often end at once
             bar.set_postfix(longest=max(episode.steps for episode in episodes), refresh=False)
             bar.update(int(ended.sum()))
-    return Evaluation(name, episodes)
+    return Evaluation(name, episodes, batch.task.motion_names)
 
 
 def play_with_baselines(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> list[Evaluation]:

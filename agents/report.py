@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from agents.evaluate import TRACKING, Evaluation
@@ -17,11 +18,12 @@ from agents.intervals import Estimate
 from agents.sb3.matches import Match
 
 _COLORS = ("tab:blue", "tab:green", "tab:purple", "tab:orange")
+_MOTIONS = 20  # that a table shows
 _SMOOTH = 20  # episodes in the moving mean of a learning curve, at least; of many, one in a hundred
 
 
 def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
-    """Print a table of the agents."""
+    """Print a table of the agents, one of how they follow motions, and one of each motion for the last agent."""
     count = len(evaluations[0].episodes)
     table = Table(title=f"{count} fresh episodes each, the same for all", title_justify="left", caption_justify="left")
     table.caption = "once, at end, of time: task fulfilled in the episode, in its last step, share of all steps"
@@ -29,11 +31,6 @@ def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
     for column in ("return", "95 % interval", "once", "at end", "of time", "distance"):
         table.add_column(column, justify="right", no_wrap=True)
     rows = [evaluation.row() for evaluation in evaluations]
-    tracking = [key for key, _ in TRACKING.values()] if "followed" in rows[0] else []
-    if tracking:
-        table.caption += "; followed: to the end; G-MPJPE and MPJPE in mm, acceleration error in mm/frame^2"
-    for column in ("followed", "G-MPJPE", "MPJPE", "accel.") if tracking else ():
-        table.add_column(column, justify="right", no_wrap=True)
     for row in rows:
         low, high = row["return_interval"]
         distance = row["mean_distance_m"]
@@ -45,8 +42,27 @@ def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
             f"{row['success_at_end']:.0%}",
             f"{row['success_share_of_steps']:.0%}",
             "" if distance is None else f"{distance:.2f} m",
-            *([f"{row['followed']:.0%}", *(f"{row[key]:.1f}" for key in tracking)] if tracking else []),
         )
+    console.print(table)
+    if "followed" in rows[0]:
+        _show_tracking("agent", "case", rows, "how closely motions were followed", console)
+    if "by_motion" in rows[-1]:
+        shown, agent = rows[-1]["by_motion"], rows[-1]["case"]
+        title = f"{agent}, by motion, the least followed first"
+        title += f": {_MOTIONS} of {len(shown)}, all are in the JSON file" if len(shown) > _MOTIONS else ""
+        _show_tracking("motion", "motion", shown[:_MOTIONS], title, console)
+
+
+def _show_tracking(column: str, key: str, rows: Sequence[Mapping[str, Any]], title: str, console: Console) -> None:
+    """Print a table of how closely motions were followed, in the terms of PHC; ``key`` names the rows."""
+    table = Table(title=title, title_justify="left", caption_justify="left")
+    table.caption = "followed: to the end; G-MPJPE and MPJPE in mm, acceleration error in mm/frame^2"
+    table.add_column(column, overflow="fold")
+    for name in ("episodes", "followed", "G-MPJPE", "MPJPE", "accel."):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        figures = (f"{row[name]:.1f}" for name, _ in TRACKING.values())
+        table.add_row(escape(row[key]), str(row["episodes"]), f"{row['followed']:.0%}", *figures)
     console.print(table)
 
 

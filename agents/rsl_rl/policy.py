@@ -17,7 +17,7 @@ from agents.checkpoint import load_weights, policy_mismatch, read_checkpoint
 from agents.config import Widths
 from agents.evaluate import Agent
 from agents.files import CHECKPOINT
-from agents.rsl_rl.curriculum import AssistSchedule
+from agents.rsl_rl.curriculum import AssistSchedule, MotionSchedule
 from agents.sb3.workers import components
 from piavatar_envs.config import FROZEN, FrozenDict
 from piavatar_envs.core.reading import UNREADABLE
@@ -71,6 +71,9 @@ class RslTraining(BatchTraining):
     ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
     assist: AssistSchedule | None = Field(
         None, description="schedule of root_assist while it learns; null for the environment's own"
+    )
+    motions: MotionSchedule | None = Field(
+        None, description="weights by which episodes draw their motions while it learns; null to draw all alike"
     )
     curriculum: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
         default_factory=dict, description="settings of the environment that differ from env while it learns"

@@ -22,7 +22,7 @@ from agents.batch_training import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, seed_all, set_random_states
 from agents.files import write_atomically, write_config
 from agents.report import Curve
-from agents.rsl_rl.curriculum import AssistedEnv, training_settings
+from agents.rsl_rl.curriculum import CURRICULA, CurriculumEnv, training_settings
 from agents.rsl_rl.policy import RslTraining, actor_settings, mean_agent, network_settings
 from agents.rsl_rl.ppo import Mirror, ScaledPPO
 from agents.sb3.workers import components
@@ -69,7 +69,7 @@ class Runner(OnPolicyRunner):
         iterations: how many it has had.
     """
 
-    def __init__(self, env: AvatarRslEnv, config: RslTraining, folder: Path, checkpoint: Checkpoint) -> None:
+    def __init__(self, env: CurriculumEnv, config: RslTraining, folder: Path, checkpoint: Checkpoint) -> None:
         """Build networks and environments, and restore the checkpoint if there is one."""
         saved = checkpoint.state
         self.curve, self.iterations, self.checkpoint = Curve(), saved["iterations"] if saved else 0, checkpoint
@@ -85,7 +85,7 @@ class Runner(OnPolicyRunner):
             }
         }
         super().__init__(env, settings, log_dir=str(folder / "rsl_rl"), device=str(env.device))
-        self.alg.check, self._config = self._check_update, config
+        self.alg.check, self._config, self._folder = self._check_update, config, folder
         self.logger.git_status_repos.clear()  # results.json has the commit; no diffs of other repositories
         if saved:
             self._restore(saved)
@@ -108,6 +108,9 @@ class Runner(OnPolicyRunner):
         super().save(path, infos)
         self.iterations, self.curve = self.current_learning_iteration + 1, self.logger.writer.curve
         self.curve.seconds = time.monotonic() - self._begun
+        if "motions" in self.env.curricula:
+            table = self.env.curricula["motions"].table(self.env.host.task.motion_names)
+            write_atomically(self._folder / "motions.csv", lambda file: file.write(table.encode()))
         self.checkpoint.save(self._state())
         self.checkpoint.stop.obey(self.checkpoint.reached)
 
@@ -136,8 +139,9 @@ class Runner(OnPolicyRunner):
 
     def _state(self) -> dict[str, Any]:
         log = self.logger
-        assist = {"assist": self.env.assist} if isinstance(self.env, AssistedEnv) else {}
-        return assist | {
+        adapted = {name: curriculum.state() for name, curriculum in self.env.curricula.items()}
+        return {
+            "curricula": adapted,
             "iterations": self.iterations,
             "algorithm": self.alg.save(),
             "envs": self.env.host.get_state(),
@@ -159,9 +163,9 @@ class Runner(OnPolicyRunner):
         log.tot_timesteps, log.tot_time = saved["logged"]
         set_random_states(saved["random"])
         self.alg.updates = self.iterations
-        if isinstance(self.env, AssistedEnv):
-            self.env.steps = self.iterations * self.env.rollout_steps
-            self.env.assist = saved["assist"].to(self.env.device)
+        self.env.steps = self.iterations * self.env.rollout_steps
+        for name, curriculum in self.env.curricula.items():
+            curriculum.load(saved["curricula"][name])
 
 
 def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
@@ -228,7 +232,7 @@ def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
     return {"data_augmentation_func": append, "use_data_augmentation": True}
 
 
-def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
+def make_env(config: RslTraining, task: Task, device: str) -> CurriculumEnv:
     """Build the training environments.
 
     Raises:
@@ -243,9 +247,9 @@ def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
         )
     groups = None if config.observe is None else {"policy": config.observe}
     about = (config.env_id, config.num_envs, device, settings, groups, config.first_seed)
-    if config.assist is None:
-        return AvatarRslEnv(*about)
-    return AssistedEnv(config.assist, config.ppo.rollout_steps, *about)
+    given = {name: getattr(config, name) for name in CURRICULA}
+    schedules = {name: settings for name, settings in given.items() if settings is not None}
+    return CurriculumEnv(schedules, config.ppo.rollout_steps, *about)
 
 
 def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:

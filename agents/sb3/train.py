@@ -69,7 +69,9 @@ def train_single(
     model, curve = train(config, workers, facts, folder, checkpoint)
     episodes, first_seed = config.evaluation.episodes, config.evaluation.first_seed
     players = baselines(len(facts.action_names), first_seed) | {"trained": policy_agent(model)}
-    return curve, [evaluate(name, agent, workers, episodes, first_seed) for name, agent in players.items()]
+    return curve, [
+        evaluate(name, agent, workers, episodes, first_seed, motions=facts.motions) for name, agent in players.items()
+    ]
 
 
 def train_cooperative(

@@ -61,6 +61,7 @@ class EnvFacts:
         action_step: rotation that an action of 1 commands in a control step [rad].
         control_dt: time of a control step [s].
         agents: names, where there are several.
+        motions: names of the task's motions, if it has any.
     """
 
     layout: ObservationLayout
@@ -68,6 +69,7 @@ class EnvFacts:
     action_step: float
     control_dt: float
     agents: tuple[str, ...] = ()
+    motions: tuple[str, ...] = ()
 
 
 def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
@@ -80,7 +82,8 @@ def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
         control_dt = bare.config.physics.control_dt
         step = bare.config.control.joint_speed_limit * control_dt
         agents = bare.names if isinstance(bare, World) else ()
-        return EnvFacts(bare.observation_layout, bare.action_names, step, control_dt, agents)
+        motions = () if agents else bare.host.task.motion_names
+        return EnvFacts(bare.observation_layout, bare.action_names, step, control_dt, agents, motions)
     finally:
         env.close()
 

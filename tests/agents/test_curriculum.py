@@ -11,7 +11,7 @@ for needed in ("rsl_rl", "tensordict", "git"):
 
 from agents.batch_training import load_batched  # noqa: E402
 from agents.rsl_rl import train as rsl_ppo  # noqa: E402
-from agents.rsl_rl.curriculum import AssistedEnv, AssistSchedule  # noqa: E402
+from agents.rsl_rl.curriculum import AssistSchedule, CurriculumEnv  # noqa: E402
 from agents.rsl_rl.policy import RslTraining  # noqa: E402
 from piavatar_envs.config import load_config, parse_assignments  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
@@ -24,7 +24,7 @@ FEW = (
 
 def test_it_falls_in_equal_steps_and_some_have_none(device):
     settings = AssistSchedule(first=0.8, rollouts=2)
-    env = AssistedEnv(settings, 3, "Stand-v0", 3, device, {"fidelity": "tiny"})
+    env = CurriculumEnv({"assist": settings}, 3, "Stand-v0", 3, device, {"fidelity": "tiny"})
     still = torch.zeros(3, env.num_actions, device=env.device)
     had = []
     for _ in range(9):
@@ -33,7 +33,7 @@ def test_it_falls_in_equal_steps_and_some_have_none(device):
     expected = [0.8] * 3 + [0.4] * 3 + [0.0] * 3
     np.testing.assert_allclose(had, np.outer(expected, [0.0, 0.5, 1.0]), atol=1e-7)
     env.close()
-    alone = AssistedEnv(settings, 3, "Stand-v0", 1, device, {"fidelity": "tiny"})
+    alone = CurriculumEnv({"assist": settings}, 3, "Stand-v0", 1, device, {"fidelity": "tiny"})
     alone.step(still[:1])
     assert alone.host.groups[0].simulation.controllers[0].assist.numpy().tolist() == pytest.approx([0.8])
     alone.close()
@@ -49,7 +49,7 @@ def test_it_falls_in_equal_steps_and_some_have_none(device):
 def test_it_falls_after_success_and_rises_after_failure(device, task, expected):
     """In a tenth of a second no body falls, and none gets up."""
     settings = AssistSchedule(first=0.8, step=0.3)
-    env = AssistedEnv(settings, 4, task, 3, device, {"fidelity": "tiny", "episode_seconds": 0.1})
+    env = CurriculumEnv({"assist": settings}, 4, task, 3, device, {"fidelity": "tiny", "episode_seconds": 0.1})
     still = torch.zeros(3, env.num_actions, device=env.device)
     for shares in np.repeat(expected, 3, axis=0):
         _, _, _, extras = env.step(still)

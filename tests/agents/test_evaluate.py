@@ -125,7 +125,16 @@ def test_tracking_is_measured_in_the_terms_of_phc(device):
     assert row["g_mpjpe_mm"] == pytest.approx(1000.0 * names["mpjpe"], rel=1e-5)
     assert row["mpjpe_mm"] == pytest.approx(1000.0 * names["local_mpjpe"], rel=1e-5)
     assert row["acceleration_error_mm"] == pytest.approx(names["acceleration_error"], rel=1e-5)
-    summed = over_seeds([row, {**row, "followed": 0.0, "mpjpe_mm": 0.0}])
+    own = [episode for episode in evaluation.episodes if episode.motion == 1]
+    shares = [one["followed"] for one in row["by_motion"]]
+    assert shares == sorted(shares) and {one["motion"] for one in row["by_motion"]} == {"idle", "kick"}
+    kick = next(one for one in row["by_motion"] if one["motion"] == "kick")
+    assert kick["episodes"] == len(own) and kick["followed"] == np.mean([not episode.terminated for episode in own])
+    assert kick["g_mpjpe_mm"] == pytest.approx(np.mean([1000.0 * episode.tracking["mpjpe"] for episode in own]))
+    lost = [{**one, "followed": 0.0} for one in row["by_motion"]]
+    summed = over_seeds([row, {**row, "followed": 0.0, "mpjpe_mm": 0.0, "by_motion": lost}])
+    halved = {one["motion"]: one["followed"] for one in summed["by_motion"]}
+    assert halved == {one["motion"]: one["followed"] / 2 for one in row["by_motion"]}
     assert summed["followed"] == pytest.approx(row["followed"] / 2) and len(summed["followed_interval"]) == 2
     assert summed["mpjpe_mm"] == pytest.approx(row["mpjpe_mm"] / 2)
 
