@@ -66,7 +66,7 @@ $(REFERENCES)/.installed: $(STAMP) tests/avatar/requirements.txt
 	@touch $@
 
 test-avatars: $(REFERENCES)/.installed
-	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py smpl_file.py smplx_source.py recordings.py) -k "makehuman or body_models or pybvh"
+	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py) -k "makehuman or published or body_models or pybvh"
 
 # Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
 # imports and compilation take longer than the tests.
