@@ -128,14 +128,16 @@ class Stage:
 
     Attributes:
         simulation: the physics.
-        task: what a :class:`~piavatar_envs.api.pictures.Picture` of the stage reads.
+        config, task: what a :class:`~piavatar_envs.api.pictures.Picture` of the stage reads.
     """
 
     def __init__(self, act: Act, fidelity: str = "coarse", device: str = "cpu") -> None:
         """Build the world; the avatar stands in the script's first pose."""
         self.act = act
         physics = {"fidelity": fidelity, **act.physics}
-        config = load_config(EnvConfig, {"physics": physics, "control": act.control, "scene": act.scene})
+        render = {"camera_position": act.view.eye, "camera_target": act.view.target}
+        settings = {"physics": physics, "control": act.control, "scene": act.scene, "render": render}
+        self.config = config = load_config(EnvConfig, settings)
         self.simulation = Simulation(config, 1, device, act.domain)
         self.task = _Backdrop(act.view.eye, act.view.target)
         self.dt, self.steps_done = config.physics.control_dt, 0

@@ -79,7 +79,7 @@ def write_meshes(folder: Path) -> tuple[Path, Path]:
 
     torus, can = folder / "torus.obj", folder / "can.obj"
     trimesh.creation.torus(0.15, 0.065, 32, 16).export(torus)
-    trimesh.creation.cylinder(0.033, 0.122, sections=24).export(can)
+    trimesh.creation.cylinder(0.036, 0.122, sections=24).export(can)
     return torus, can
 
 
