@@ -223,13 +223,13 @@ class Gltf:
     @cached_property
     def skins(self) -> list[Skin]:
         """The skins of the file."""
-        with reading(self.path, "a glTF file"):
+        with reading(self.path, "a glTF file that can be read"):
             return [self._skin(index, skin) for index, skin in enumerate(self.items("skins"))]
 
     @cached_property
     def animations(self) -> list[Animation]:
         """The animations of the file; tracks of what is not read (weights of morph targets) are left out."""
-        with reading(self.path, "a glTF file"):
+        with reading(self.path, "a glTF file that can be read"):
             return [self._animation(index, animation) for index, animation in enumerate(self.items("animations"))]
 
     def local_at(self, animation: Animation, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -567,7 +567,7 @@ def read_gltf(path: str | Path) -> Gltf:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}")
-    with reading(path, "a glTF file"):
+    with reading(path, "a glTF file that can be read"):
         if path.stat().st_size > MAX_FILE:
             raise ValueError(f"it has {path.stat().st_size} bytes, more than {MAX_FILE}")
         content = path.read_bytes()
