@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from piavatar_envs.avatar.body.groups import MOST_GROUPS
 from piavatar_envs.avatar.gltf import MAX_VALUES, Gltf, numbers, whole
 from piavatar_envs.core.extras import install_command
-from piavatar_envs.core.reading import UNREADABLE, reading
+from piavatar_envs.core.reading import UNREADABLE, first_line, reading
 
 MAX_VERTICES, MAX_TRIANGLES = 6_000_000, 6_000_000
 MAX_PIXELS = 2**26  # of a texture
 TEXTURE_SIDE = 1024  # [pixels] to which larger textures are averaged down
-MOST_GROUPS = 256  # that are painted
 MAX_SETS = 4  # of JOINTS_n and WEIGHTS_n
 SAME_PLACE = 5e-3  # of the size of a skeleton, within which skins agree on a joint
 _SIMPLIFY = "simplify it with: npx @gltf-transform/cli simplify IN.glb OUT.glb"
@@ -376,7 +376,7 @@ class _Reader:
                 picture.thumbnail((TEXTURE_SIDE, TEXTURE_SIDE))
                 return np.asarray(picture)
         except (*UNREADABLE, Image.DecompressionBombError) as error:
-            self.notes.append(f"texture {number} is left out: {str(error).splitlines()[0] if str(error) else error!r}")
+            self.notes.append(f"texture {number} is left out: {first_line(error)}")
             return None
 
 

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.interpolation import interpolation_matrix
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, bone_maps, local_rotations
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import PoseDisplacements
@@ -150,8 +150,8 @@ class Skin:
             rotations = np.asarray(rotations, dtype=np.float64)
             vertices += _turned(self._vertex_weights, rotations, self._pose.displacement(rotations))
             if self._correctives is not None:
-                local = np.concatenate([rotations[:1], rotations[list(PARENTS[1:])].transpose(0, 2, 1) @ rotations[1:]])
-                own = self._correctives.displacement(Rotation.from_matrix(local).as_quat())
+                local = Rotation.from_matrix(local_rotations(rotations))
+                own = self._correctives.displacement(local.as_quat())
                 displacement -= _turned(self._particle_weights, rotations, own)
         return (vertices + self._interpolation @ displacement).astype(np.float32)
 
@@ -161,10 +161,9 @@ class Skin:
 
     def _transforms(self, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """Return rest-to-world transforms stacked for the skinning matrices, shape ``(88, 3)``."""
-        rotations = np.asarray(rotations, dtype=np.float64)
-        translations = np.asarray(positions, dtype=np.float64) - np.einsum("bij,bj->bi", rotations, self._rest_joints)
-        stacked = np.concatenate([rotations.transpose(0, 2, 1), translations[:, None, :]], axis=1)
-        return stacked.reshape(4 * NUM_JOINTS, 3)
+        rotations, positions = (np.asarray(values, dtype=np.float64) for values in (rotations, positions))
+        maps = bone_maps(rotations, positions, self._rest_joints)
+        return maps.transpose(0, 2, 1).reshape(4 * NUM_JOINTS, 3)
 
 
 #: Skins by the digest of what they were baked from, the one that was used last at the end.

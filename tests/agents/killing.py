@@ -11,10 +11,13 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -34,6 +37,23 @@ class KillAt(BaseCallback):
         if self.num_timesteps >= self.steps:
             raise Killed
         return True
+
+
+@contextmanager
+def killed_in_step(views: type, count: int) -> Iterator[None]:
+    """Kill a training in this process in the ``count``-th step of its environments, and check that it was."""
+    step, left = views.step, count
+
+    def killed(self: Any, actions: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise Killed
+        return step(self, actions)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(views, "step", killed)
+        yield
 
 
 def run_killed(count: int, *args: str) -> None:

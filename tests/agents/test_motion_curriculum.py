@@ -15,7 +15,7 @@ from agents import play as play_script  # noqa: E402
 from agents.rsl_rl import train as rsl_ppo  # noqa: E402
 from agents.rsl_rl.curriculum import CurriculumEnv, MotionSchedule  # noqa: E402
 from piavatar_envs.config import ConfigError  # noqa: E402
-from tests.agents.killing import Killed, flat  # noqa: E402
+from tests.agents.killing import flat, killed_in_step  # noqa: E402
 
 #: Targets without actions follow the slow motions to 4 cm, and are 9 cm behind the kick.
 SETTINGS = {
@@ -61,7 +61,7 @@ def test_one_motion_is_not_weighed(device):
             CurriculumEnv(schedule, 4, task, 1, device, settings)
 
 
-def test_a_training_resumes_with_its_weights_and_is_scored_by_motion(device, tmp_path, monkeypatch, capsys):
+def test_a_training_resumes_with_its_weights_and_is_scored_by_motion(device, tmp_path, capsys):
     """Bit for bit; ``step`` is held out, and the trained policy plays it."""
     config = {
         "env_id": TRACK, "num_envs": 4, "iterations": 4, "checkpoint_every": 1, "evaluation": {"episodes": 6},
@@ -74,17 +74,8 @@ def test_a_training_resumes_with_its_weights_and_is_scored_by_motion(device, tmp
     rsl_ppo.main([*command, str(tmp_path / "whole")])
     printed = capsys.readouterr().out
     assert "trained, by motion" in printed
-    parts, step, left = tmp_path / "parts", rsl_ppo.AvatarRslEnv.step, 20  # in the third iteration
-
-    def killed(self, actions):
-        nonlocal left
-        left -= 1
-        if left == 0:
-            raise Killed
-        return step(self, actions)
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(rsl_ppo.AvatarRslEnv, "step", killed)
+    parts = tmp_path / "parts"
+    with killed_in_step(rsl_ppo.AvatarRslEnv, 20):  # in the third iteration
         rsl_ppo.main([*command, str(parts)])
     rsl_ppo.main([*command, str(parts), "--resume"])
     whole, resumed = (

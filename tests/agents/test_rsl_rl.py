@@ -20,7 +20,7 @@ from agents.rsl_rl.policy import RslTraining  # noqa: E402
 from piavatar_envs.api.host import EpisodeHost  # noqa: E402
 from piavatar_envs.avatar.motion import deepmimic  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
-from tests.agents.killing import Killed, flat  # noqa: E402
+from tests.agents.killing import flat, killed_in_step  # noqa: E402
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "rsl_rl").glob("*.yaml"))
 TINY = (
@@ -88,7 +88,7 @@ def test_updates_aim_at_smaller_and_smaller_divergences(tmp_path, monkeypatch, c
         rsl_ppo.main([*run, "ppo.desired_kl=null", "--out", str(tmp_path / "none")])
 
 
-def test_an_interrupted_training_resumes_bit_for_bit(device, tmp_path, monkeypatch):
+def test_an_interrupted_training_resumes_bit_for_bit(device, tmp_path):
     """With an adaptive rate, normalised observations and an assist schedule, whose states resume as well."""
     path = next(path for path in CONFIGS if path.stem == "stand_rsl")
     longer = [setting for setting in TINY if not setting.startswith("iterations")]
@@ -96,17 +96,8 @@ def test_an_interrupted_training_resumes_bit_for_bit(device, tmp_path, monkeypat
     longer += ["assist={first: 0.5, step: 0.2}"]
     command, more = ([str(path), *longer, f"iterations={n}", "--device", device, "--out"] for n in (5, 8))
     rsl_ppo.main([*command, str(tmp_path / "whole")])
-    parts, step, left = tmp_path / "parts", rsl_ppo.AvatarRslEnv.step, 26  # in the fourth iteration
-
-    def killed(self, actions):
-        nonlocal left
-        left -= 1
-        if left == 0:
-            raise Killed
-        return step(self, actions)
-
-    with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(rsl_ppo.AvatarRslEnv, "step", killed)
+    parts = tmp_path / "parts"
+    with killed_in_step(rsl_ppo.AvatarRslEnv, 26):  # in the fourth iteration
         rsl_ppo.main([*command, str(parts)])
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] < 4
     rsl_ppo.main([*command, str(parts), "--resume"])

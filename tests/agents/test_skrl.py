@@ -20,7 +20,7 @@ from agents.checkpoint import Checkpoint  # noqa: E402
 from agents.skrl import train as skrl_mappo  # noqa: E402
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv  # noqa: E402
 from piavatar_envs.config import ConfigError  # noqa: E402
-from tests.agents.killing import Killed, flat  # noqa: E402
+from tests.agents.killing import flat, killed_in_step  # noqa: E402
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "skrl").glob("*.yaml"))
 TINY = (
@@ -177,9 +177,8 @@ def test_training_repeats_and_depends_on_its_seed(config, env, device, tmp_path)
     assert np.abs(actions[0] - actions[3]).max() > 1e-5, "an update less"
 
 
-def test_what_is_interrupted_goes_on_as_if_it_had_not_been(config, device, tmp_path, monkeypatch):
+def test_what_is_interrupted_goes_on_as_if_it_had_not_been(config, device, tmp_path):
     """Interrupted in the fourth iteration, after the second one was kept, and finished; then made longer."""
-    step = skrl_mappo.Worlds.step
 
     def run(name: str, iterations: int, resume: bool = True):
         changed = config.model_copy(update={"iterations": iterations, "checkpoint_every": 2})
@@ -191,19 +190,8 @@ def test_what_is_interrupted_goes_on_as_if_it_had_not_been(config, device, tmp_p
         return curve.steps, curve.returns, flat({name: saved[name] for name in ("agents", "envs", "playing", "random")})
 
     whole = run("whole", 5)
-    steps = 3 * config.mappo.rollout_steps + 3
-
-    def killed(self, actions):
-        nonlocal steps
-        steps -= 1
-        if steps < 0:
-            raise Killed
-        return step(self, actions)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(skrl_mappo.Worlds, "step", killed)
-        with pytest.raises(Killed):
-            run("parts", 4)
+    with killed_in_step(skrl_mappo.Worlds, 3 * config.mappo.rollout_steps + 4):
+        run("parts", 4)
     assert torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 2
     run("parts", 4)
     run("parts", 4)  # there is nothing left to do

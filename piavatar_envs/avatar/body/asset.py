@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, local_rotations
 
 NUM_SKIN_JOINTS = 4
 SAMPLE_DEVIATION = 0.4  # standard deviation of a sampled shape parameter, before the clip to [-1, 1]
@@ -47,12 +47,8 @@ class PoseDisplacements:
         Args:
             rotations: world rotations of the bones, identity in the reference pose, shape ``(22, 3, 3)``.
         """
-        parents = list(PARENTS[1:])
-        turned, still = rotations @ self.reference, self.reference
-        moved = turned[parents].transpose(0, 2, 1) @ turned[1:]
-        rest = still[parents].transpose(0, 2, 1) @ still[1:]
-        flat = self.directions.reshape(-1, 9 * len(parents))
-        return (flat @ (moved - rest).astype(np.float32).ravel()).reshape(-1, 3)
+        change = (local_rotations(rotations @ self.reference) - local_rotations(self.reference))[1:]
+        return (self.directions.reshape(-1, change.size) @ change.astype(np.float32).ravel()).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +219,12 @@ class AvatarAsset:
                 f"shape parameter {index} ({self.shape_names[index]}) is {values[index]:g}; keep it within [-1, 1]"
             )
         return np.stack([np.maximum(-values, 0.0), np.maximum(values, 0.0)], axis=1)
+
+
+def area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the normals of triangles, as long as their areas [m^2], shape ``(T, 3)`` float64."""
+    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
+    return 0.5 * np.cross(b - a, c - a)
 
 
 def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:

@@ -14,11 +14,18 @@ import numpy as np
 from scipy import sparse
 
 from piavatar_envs.avatar.body import closed_skin, sampling
-from piavatar_envs.avatar.body.asset import AvatarAsset, Look, PoseDisplacements, top_weights
+from piavatar_envs.avatar.body.asset import AvatarAsset, Look, PoseDisplacements, area_vectors, top_weights
 from piavatar_envs.avatar.body.closed_skin import CELL, ClosedSkin, close_skin, distinct, read_soup, unique_rows
 from piavatar_envs.avatar.body.groups import on_skin
 from piavatar_envs.avatar.body.rigs import spread_weights
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.skeleton import (
+    NUM_JOINTS,
+    blended_maps,
+    bone_maps,
+    forward_kinematics,
+    joint_index,
+    local_rotations,
+)
 from piavatar_envs.avatar.body.skeleton_mesh import moved, read_skeleton
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs
 from piavatar_envs.core.result_cache import digest_of, kept
@@ -211,21 +218,17 @@ def reference_rotations(joints: np.ndarray) -> np.ndarray:
 
 def _moved_joints(joints: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return joints ``(22, 3)`` after world rotations of the bones, the pelvis in its place."""
-    local = rotations.copy()
-    for joint in range(1, NUM_JOINTS):
-        local[joint] = rotations[PARENTS[joint]].T @ rotations[joint]
-    return forward_kinematics(local, joints[0], joints)[1]
+    return forward_kinematics(local_rotations(rotations), joints[0], joints)[1]
 
 
 def _turn(joints: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Return the affine maps of the bones, shape ``(22, 3, 4)``."""
-    moved = _moved_joints(joints, rotations)
-    return np.concatenate([rotations, (moved - np.einsum("bij,bj->bi", rotations, joints))[..., None]], axis=2)
+    return bone_maps(rotations, _moved_joints(joints, rotations), joints)
 
 
 def _blend(weights: np.ndarray, matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Apply linear blend skinning of all joints to points, shape ``(V, 3)`` float64."""
-    blended = (weights @ matrix.reshape(NUM_JOINTS, 12)).reshape(-1, 3, 4)
+    blended = blended_maps(weights, matrix)
     return np.einsum("vij,vj->vi", blended[:, :, :3], points) + blended[:, :, 3]
 
 
@@ -268,8 +271,7 @@ def _coarser(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple
     """
     if len(faces) <= MOST_DRAWN:
         return faces, part
-    corners = vertices[faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    area = np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()
     used = np.unique(faces)
     place = np.floor(vertices[used] / np.sqrt(2.0 * area / MOST_DRAWN)).astype(np.int64)
     # clothes and the body beneath them have cells of their own

@@ -23,7 +23,7 @@ import warp as wp
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components
 
-from piavatar_envs.avatar.body.asset import mesh_volume
+from piavatar_envs.avatar.body.asset import area_vectors, mesh_volume
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.core.kernel_cache import init_warp
 
@@ -247,10 +247,7 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _shell(points: np.ndarray, faces: np.ndarray, rows: np.ndarray, first: int) -> tuple[Shell, list[np.ndarray]]:
     """Return a shell, and the corners of its boundary loops, whose means are the vertices from ``first`` on."""
-    corners = points[faces]
-    area = 0.5 * float(
-        np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    )
+    area = float(np.linalg.norm(area_vectors(points, faces), axis=1).sum())
     start, end = _boundary(faces)
     used, local = np.unique(np.concatenate([start, end]), return_inverse=True)
     ring = local.reshape(2, -1)

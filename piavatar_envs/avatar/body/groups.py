@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from piavatar_envs.avatar.body.asset import AvatarAsset
+from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors
 from piavatar_envs.avatar.body.sampling import ParticleSet
 from piavatar_envs.core.reading import reading
 
@@ -79,7 +79,6 @@ def flesh_of(asset: AvatarAsset, sampled: ParticleSet, name: str) -> np.ndarray:
 
 def skin_shares(asset: AvatarAsset) -> dict[str, float]:
     """Return the share of the skin's area that each group has: of triangles with most of it, by name."""
-    a, b, c = (asset.vertices[asset.faces[:, corner]].astype(np.float64) for corner in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = np.linalg.norm(area_vectors(asset.vertices, asset.faces), axis=1)
     inside = {name: weights[asset.faces].mean(axis=1) >= MEMBER for name, weights in asset.groups.items()}
     return {name: float(area[own].sum() / area.sum()) for name, own in inside.items()}

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights
+from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors, dense_weights
 from piavatar_envs.avatar.body.sampling import ClosedSurface
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, blended_maps, bone_maps, forward_kinematics, joint_index
 
 #: Joints whose rotation is fitted: both sides mirrored, and about the left axis alone.
 _MIRRORED = ("collar", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
@@ -118,8 +118,7 @@ class Model:
         rest = self._vertices + np.tensordot(halves, self._deltas, axes=2)
         joints = self.asset.joints + np.tensordot(halves, self.asset.shape_joints.astype(np.float64), axes=2)
         rotations, positions = forward_kinematics(fit.local_rotations(), joints[0], joints)
-        moves = np.concatenate([rotations, (positions - np.einsum("bij,bj->bi", rotations, joints))[..., None]], axis=2)
-        blended = (self._weights @ moves.reshape(NUM_JOINTS, 12)).reshape(-1, 3, 4)
+        blended = blended_maps(self._weights, bone_maps(rotations, positions, joints))
         posed = np.einsum("nij,nj->ni", blended[..., :3], rest) + blended[..., 3]
         turn = Rotation.from_rotvec(fit.turn)
         normals = turn.apply(np.einsum("nij,nj->ni", blended[..., :3], self._normals))
@@ -180,8 +179,7 @@ def register(asset: AvatarAsset, vertices: np.ndarray, faces: np.ndarray, body: 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return unit normals of vertices, the mean of their triangles' by area, shape ``(V, 3)``."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    area = np.cross(b - a, c - a)
+    area = area_vectors(vertices, faces)
     normals = np.zeros((len(vertices), 3))
     for corner, axis in np.ndindex(3, 3):
         normals[:, axis] += np.bincount(faces[:, corner], area[:, axis], len(vertices))
@@ -195,7 +193,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 def _sample(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> Cloud:
     """Return points that are spread evenly over the area of a surface."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = area_vectors(vertices, faces)
     area = np.linalg.norm(normal, axis=1)
     chosen = np.searchsorted(np.cumsum(area), (np.arange(count) + 0.5) / count * area.sum()).clip(0, len(faces) - 1)
     u, v = rng.random((2, count))

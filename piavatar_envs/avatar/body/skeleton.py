@@ -124,6 +124,27 @@ def forward_kinematics(
     return rotations, positions
 
 
+def local_rotations(rotations: np.ndarray) -> np.ndarray:
+    """Return rotations of the joints relative to their parents from those of the bones, both shape ``(22, 3, 3)``."""
+    return np.concatenate([rotations[:1], rotations[list(PARENTS[1:])].transpose(0, 2, 1) @ rotations[1:]])
+
+
+def bone_maps(rotations: np.ndarray, positions: np.ndarray, rest_joints: np.ndarray) -> np.ndarray:
+    """Return the affine maps of the bones from rest to world, shape ``(22, 3, 4)``; arguments as for :func:`skin`."""
+    translations = positions - np.einsum("bij,bj->bi", rotations, rest_joints)
+    return np.concatenate([rotations, translations[..., None]], axis=2)
+
+
+def blended_maps(weights: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """Return the affine maps of points by linear blend skinning, shape ``(N, 3, 4)``.
+
+    Args:
+        weights: of all bones, rows sum to one, shape ``(N, 22)``.
+        maps: of the bones, from :func:`bone_maps`.
+    """
+    return (weights @ maps.reshape(NUM_JOINTS, 12)).reshape(-1, 3, 4)
+
+
 def skin(
     points: np.ndarray,
     skin_joints: np.ndarray,
@@ -145,7 +166,7 @@ def skin(
     Returns:
         World positions [m], shape ``(N, 3)``.
     """
-    translations = positions - np.einsum("bij,bj->bi", rotations, rest_joints)
+    translations = bone_maps(rotations, positions, rest_joints)[..., 3]
     blended_rotation = np.einsum("nk,nkij->nij", skin_weights, rotations[skin_joints])
     blended_translation = np.einsum("nk,nki->ni", skin_weights, translations[skin_joints])
     return np.einsum("nij,nj->ni", blended_rotation, points) + blended_translation
