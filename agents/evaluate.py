@@ -187,6 +187,10 @@ def by_motion(episodes: Sequence[Episode], names: Sequence[str]) -> list[dict[st
     rows = [
         {"motion": names[motion], "episodes": len(own), **tracking_of(own)} for motion, own in sorted(groups.items())
     ]
+    return _least_followed_first(rows)
+
+
+def _least_followed_first(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: (row["followed"], -row["g_mpjpe_mm"]))
 
 
@@ -242,10 +246,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         shares = [row[name] for row in rows]
         summed |= {name: float(np.mean(shares)), f"{name}_interval": share_interval_over_seeds(shares, episodes)}
     if all("followed" in row for row in rows):
-        shares = [row["followed"] for row in rows]
-        summed |= {"followed": float(np.mean(shares))}
-        summed |= {"followed_interval": share_interval_over_seeds(shares, episodes)}
-        summed |= {key: float(np.mean([row[key] for row in rows])) for key, _ in TRACKING.values()}
+        summed |= _tracking_over_seeds(rows, episodes)
     if all("by_motion" in row for row in rows):
         summed["by_motion"] = _motions_over_seeds([row["by_motion"] for row in rows])
     if "by_push" in rows[0]:
@@ -258,19 +259,19 @@ def _motions_over_seeds(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[d
     of_motion: dict[str, list[Mapping[str, Any]]] = {}
     for row in (row for table in tables for row in table):
         of_motion.setdefault(row["motion"], []).append(row)
-    averaged = []
-    for name, rows in of_motion.items():
-        shares, episodes = [row["followed"] for row in rows], rows[0]["episodes"]
-        averaged.append(
-            {
-                "motion": name,
-                "episodes": episodes,
-                "followed": float(np.mean(shares)),
-                "followed_interval": share_interval_over_seeds(shares, episodes),
-                **{key: float(np.mean([row[key] for row in rows])) for key, _ in TRACKING.values()},
-            }
-        )
-    return sorted(averaged, key=lambda row: (row["followed"], -row["g_mpjpe_mm"]))
+    averaged = [
+        {"motion": name, "episodes": rows[0]["episodes"], **_tracking_over_seeds(rows, rows[0]["episodes"])}
+        for name, rows in of_motion.items()
+    ]
+    return _least_followed_first(averaged)
+
+
+def _tracking_over_seeds(rows: Sequence[Mapping[str, Any]], episodes: int) -> dict[str, Any]:
+    """Average figures of :func:`tracking_of` of several trainings in the same ``episodes``."""
+    shares = [row["followed"] for row in rows]
+    figures = {key: float(np.mean([row[key] for row in rows])) for key, _ in TRACKING.values()}
+    interval = share_interval_over_seeds(shares, episodes)
+    return {"followed": float(np.mean(shares)), "followed_interval": interval, **figures}
 
 
 def _pooled(pushes: Sequence[Mapping[str, Any]], seeds: int) -> list[dict[str, Any]]:
