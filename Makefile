@@ -15,7 +15,7 @@ help:
 	@echo "make demo      train PPO on PIAvatar/Reach-v0 on the CPU (ten minutes at most), leaves runs/demo/"
 	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
 	@echo "make test-lowest   test the views under the oldest supported Gymnasium and PettingZoo"
-	@echo "make test-avatars  compare avatars and motions with MakeHuman's data, body-models and pybvh"
+	@echo "make test-avatars  compare avatars and motions with MakeHuman's data, body-models, pybvh and gsply"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too; CHECK=1 compares only)"
@@ -66,7 +66,7 @@ $(REFERENCES)/.installed: $(STAMP) tests/avatar/requirements.txt
 	@touch $@
 
 test-avatars: $(REFERENCES)/.installed
-	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py) -k "makehuman or published or body_models or pybvh"
+	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py splats.py) -k "makehuman or published or body_models or pybvh or gsply"
 
 # Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
 # imports and compilation take longer than the tests.

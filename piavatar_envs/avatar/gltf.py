@@ -37,7 +37,8 @@ _WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 _READ = frozenset(
     "KHR_mesh_quantization KHR_texture_transform KHR_texture_basisu EXT_texture_webp EXT_texture_avif "
     "KHR_lights_punctual MSFT_texture_dds VRM VRMC_vrm VRMC_springBone VRMC_node_constraint VRMC_materials_mtoon "
-    "VRMC_materials_hdr_emissiveMultiplier KHR_animation_pointer KHR_xmp_json_ld".split()
+    "VRMC_materials_hdr_emissiveMultiplier KHR_animation_pointer KHR_xmp_json_ld "
+    "KHR_gaussian_splatting".split()
 )
 _COMPRESSED = {
     "EXT_meshopt_compression": "undo the compression with: npx @gltf-transform/cli copy IN.glb OUT.glb",

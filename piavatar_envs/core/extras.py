@@ -16,6 +16,7 @@ EXTRAS = {
     "skrl": ("skrl", "torch"),
     "rsl": ("rsl_rl", "tensordict", "torch"),
     "live": ("viser",),
+    "splats": ("gsply",),
     "bench": ("mujoco",),
     "dev": ("pytest", "xdist", "build"),
 }

@@ -99,7 +99,10 @@ def _load(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise FileNotFoundError(f"there is no file {path}")
     vertices, faces, colors = (_load_gltf if path.suffix.lower() in _GLTF else _load_other)(path)
     if not len(faces):
-        raise ValueError(f"{path.name} has no triangles; export a surface, not points, curves or an empty scene")
+        raise ValueError(
+            f"{path.name} has no triangles; export a surface, not points, curves or an empty scene, or use the source "
+            "gaussian for splats"
+        )
     if not np.isfinite(vertices).all():
         raise ValueError(f"{path.name} has vertices that are not finite; export it again")
     return vertices, faces, colors.reshape(len(vertices), 3)

@@ -1,0 +1,255 @@
+"""Splats: covariances and colours that turn with them, files that are read and written, and files that are refused."""
+
+from __future__ import annotations
+
+import struct
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.body.splat_files import read_splats, write_ply
+from piavatar_envs.avatar.body.splats import SplatCloud, harmonics, turned_colors
+from piavatar_envs.core.extras import MissingExtra
+from tests.avatar.gltf_files import Y_UP, Writer
+from tests.avatar.splat_clouds import on_body
+
+FIELDS = ("means", "rotations", "scales", "opacities", "sh")
+
+
+@pytest.fixture(scope="module")
+def cloud() -> SplatCloud:
+    return on_body(load_asset(), 300, degree=3)
+
+
+def assert_equal(one: SplatCloud, other: SplatCloud, tolerance: float) -> None:
+    for name in FIELDS:
+        first, second = getattr(one, name), getattr(other, name)
+        if name == "rotations":  # q and -q are one rotation
+            first = first * np.sign((first * second).sum(axis=1, keepdims=True))
+        np.testing.assert_allclose(first, second, atol=tolerance, rtol=tolerance)
+
+
+def with_rows(cloud: SplatCloud, order: str) -> tuple[list[str], np.ndarray]:
+    """Return the names and values of a 3DGS file."""
+    rest = cloud.sh[:, 1:].transpose(0, 2, 1).reshape(len(cloud), -1)
+    names = ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), "x", "y", "z"]
+    names += [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest.shape[1]))]
+    o = cloud.opacities.astype(np.float64)
+    columns = [np.log(o / (1.0 - o))[:, None], np.log(cloud.scales), np.roll(cloud.rotations, 1, axis=1), cloud.means]
+    return names, np.concatenate([*columns, cloud.sh[:, 0], rest], axis=1).astype(f"{order}f4")
+
+
+def ply(names: list[str], rows: np.ndarray, form: str, before: str = "") -> bytes:
+    header = f"ply\nformat {form} 1.0\ncomment x\n{before}element vertex {len(rows)}\n"
+    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    if form == "ascii":
+        return (header + "".join(" ".join(f"{value:.9g}" for value in row) + "\n" for row in rows)).encode()
+    return header.encode() + rows.tobytes()
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_forms_of_ply(cloud, form, degree, tmp_path):
+    own = SplatCloud(*(getattr(cloud, name) for name in FIELDS[:-1]), cloud.sh[:, : (degree + 1) ** 2])
+    names, rows = with_rows(own, ">" if "big" in form else "<")
+    (tmp_path / "a.ply").write_bytes(ply(names, rows, form))
+    read = read_splats(tmp_path / "a.ply")
+    assert_equal(read, own, 2e-6)
+    write_ply(tmp_path / "b.ply", read)
+    assert_equal(read_splats(tmp_path / "b.ply"), read, 2e-6)
+
+
+def test_elements_before_the_vertices_are_skipped(cloud, tmp_path):
+    names, rows = with_rows(cloud, "<")
+    content = ply(names, rows, "binary_little_endian", "element camera 2\nproperty double f\nproperty uchar k\n")
+    end = content.index(b"end_header\n") + len(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(content[:end] + bytes(18) + content[end:])
+    assert_equal(read_splats(tmp_path / "a.ply"), cloud, 2e-6)
+
+
+def gltf_of(cloud: SplatCloud, path, **change):
+    """Write a cloud in glTF's axes."""
+    turned = cloud.placed(Y_UP, 1.0, np.zeros(3))
+    out = Writer()
+    names = {"POSITION": turned.means, "ROTATION": turned.rotations, "SCALE": turned.scales}
+    names |= {"OPACITY": turned.opacities[:, None]}
+    for k in range(turned.sh.shape[1]):
+        names[f"SH_DEGREE_{int(k**0.5)}_COEF_{k - int(k**0.5) ** 2}"] = turned.sh[:, k]
+    kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+    attributes = {
+        name if name == "POSITION" else f"KHR_gaussian_splatting:{name}": out.accessor(array, kinds[array.shape[1]])
+        for name, array in names.items()
+    }
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": extension}}
+    out.add("meshes", {"primitives": [primitive | change]})
+    out.document["nodes"] = [{"mesh": 0, "scale": [2.0, 2.0, 2.0], "translation": [0.0, 1.0, 0.0]}]
+    out.document["extensionsUsed"] = out.document["extensionsRequired"] = ["KHR_gaussian_splatting"]
+    return out.save(path)
+
+
+def test_gltf(cloud, tmp_path):
+    read = read_splats(gltf_of(cloud, tmp_path / "a.glb")).placed(Y_UP.T, 1.0, np.zeros(3))
+    assert_equal(read, cloud.placed(np.eye(3), 2.0, np.array([0.0, 0.0, 1.0])), 1e-5)
+    with pytest.raises(ValueError, match="kernel"):
+        read_splats(gltf_of(cloud, tmp_path / "b.glb", mode=4))
+
+
+def test_colours_turn_with_their_splats(cloud):
+    turns = Rotation.random(len(cloud), rng=np.random.default_rng(1)).as_matrix()
+    seen = Rotation.random(rng=np.random.default_rng(2)).as_matrix()[0]
+    found = np.einsum("k,skc->sc", harmonics(seen, 3), turned_colors(cloud.sh, turns))
+    before = np.einsum("sk,skc->sc", harmonics(np.einsum("sji,j->si", turns, seen), 3), cloud.sh)
+    np.testing.assert_allclose(found, before, atol=1e-5)
+
+
+def test_a_deformed_cloud_has_the_covariances_given(cloud):
+    stretch = np.random.default_rng(0).normal(size=(3, 3))
+    covariances = stretch @ cloud.covariances() @ stretch.T
+    moved = SplatCloud.deformed(cloud, cloud.means, covariances)
+    scale = np.trace(covariances, axis1=1, axis2=2)[:, None, None]
+    np.testing.assert_allclose(moved.covariances() / scale, covariances / scale, atol=1e-6)
+
+
+def header_of(lines: str, form: str = "binary_little_endian") -> bytes:
+    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
+    properties = "".join(f"property float {name}\n" for name in names)
+    return f"ply\nformat {form} 1.0\n{lines}{properties}end_header\n".encode()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.ply", b"", "PLY header"),
+        ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "PLY header"),
+        ("a.ply", header_of("element vertex 4000000\n"), "4000000 vertex rows, and 0 follow"),
+        ("a.ply", header_of("element vertex 4000000000\n"), r"4000000000 splats, outside \[1, 10000000\]"),
+        ("a.ply", header_of("element vertex 4000000\n", "ascii"), "4000000 rows of 14 numbers"),
+        ("a.ply", header_of("element vertex 0\n"), "0 splats"),
+        ("a.ply", header_of("element face 1\nproperty list uchar int i\nelement vertex 1\n") + bytes(56), "lists"),
+        ("a.ply", header_of("element vertex 1\nproperty float f_rest_0\n") + bytes(60), "1 properties f_rest_i"),
+        ("a.ply", header_of("element vertex 1\n") + bytes(56), "quaternion of splat 0 is zero"),
+        ("a.ply", header_of("element vertex 1\n") + b"\xff" * 56, "splat 0 are not finite"),
+        ("a.ply", header_of("element vertex 1\nproperty float3 q\n"), "the line 'property float3 q'"),
+        ("a.ply", header_of("element vertex 1\n").replace(b"rot_3", b"rot_4"), "no property rot_3.*source mesh"),
+        ("a.ply", header_of("element vertex 1\n").replace(b"float x", b"uchar x"), "x is of type u1"),
+        ("a.ply", header_of("element vertex 1\n", "ascii") + b"1 2 x " * 5, "row 0 .* 15 numbers, not 14"),
+        ("a.spz", b"NGSP", "no SPZ of version 1 to 3"),
+        ("a.spz", b"\x1f\x8b123456", "a.spz is not a file"),
+        ("a.glb", b"glTF", "a.glb is not a"),
+        ("a.splat", b"", "use one of .ply, .spz"),
+    ],
+)  # fmt: skip
+def test_files_that_are_no_splats_are_refused(name, content, message, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    began = time.perf_counter()
+    with pytest.raises(ValueError, match=message) as error:
+        read_splats(tmp_path / name)
+    assert time.perf_counter() - began < 1.0 and "\n" not in str(error.value)
+    with pytest.raises(FileNotFoundError):
+        read_splats(tmp_path / "none.ply")
+
+
+def test_memory_stays_within_four_times_the_file(cloud, tmp_path):
+    many = cloud.chosen(np.arange(20_000) % len(cloud))
+    write_ply(tmp_path / "a.ply", many)
+    gltf_of(many, tmp_path / "a.glb")
+    for name in ("a.ply", "a.glb"):
+        tracemalloc.start()
+        read_splats(tmp_path / name)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert most < 4 * (tmp_path / name).stat().st_size
+
+
+def mutations(content: bytes, rng: np.random.Generator, count: int):
+    """Yield damaged copies: bytes changed anywhere or in the header, numbers exchanged, cut off, doubled parts."""
+    for _ in range(count):
+        damaged, way = bytearray(content), rng.integers(5)
+        if way == 0:
+            for _ in range(rng.integers(1, 6)):
+                damaged[rng.integers(len(damaged))] = rng.integers(256)
+        elif way == 1:
+            for _ in range(rng.integers(1, 4)):
+                damaged[rng.integers(min(1200, len(damaged)))] = rng.integers(256)
+        elif way == 2:
+            digits = [i for i, value in enumerate(damaged[:3000]) if chr(value).isdigit()]
+            for _ in range(rng.integers(1, 4) if digits else 0):
+                damaged[digits[rng.integers(len(digits))]] = ord("0") + rng.integers(10)
+        elif way == 3:
+            del damaged[rng.integers(len(damaged)) :]
+        else:
+            first, last = np.sort(rng.integers(len(damaged), size=2))
+            damaged[last:last] = damaged[first:last]
+        yield bytes(damaged)
+
+
+def test_damaged_files_are_read_or_refused(cloud, tmp_path):
+    few = cloud.chosen(np.arange(5))
+    names, rows = with_rows(few, "<")
+    contents = [ply(names, rows, "binary_little_endian"), ply(names, rows, "ascii")]
+    contents.append(gltf_of(few, tmp_path / "whole.glb").read_bytes())
+    rng = np.random.default_rng(0)
+    for content, name in zip(contents, ("a.ply", "b.ply", "c.glb"), strict=True):
+        refused = 0
+        for damaged in mutations(content, rng, 120):
+            (tmp_path / name).write_bytes(damaged)
+            try:
+                read = read_splats(tmp_path / name)
+                assert np.isfinite(read.means).all()
+            except ValueError as error:
+                assert "\n" not in str(error)
+                refused += 1
+        assert refused > 20
+
+
+def test_an_spz_that_promises_more_than_it_holds_is_refused_without_gsply(tmp_path):
+    import gzip
+
+    for count, message in ((1_000_000, "20000016 bytes of 1000000 splats"), (2**32 - 1, "4294967295 splats")):
+        head = struct.pack("<IIIBBBB", 0x5053474E, 3, count, 0, 12, 0, 0)
+        (tmp_path / "a.spz").write_bytes(gzip.compress(head))
+        with pytest.raises(ValueError, match=message):
+            read_splats(tmp_path / "a.spz")
+    (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(10_000_000)))
+    with pytest.raises(ValueError, match="64 times its size"):
+        read_splats(tmp_path / "a.spz")
+
+
+def test_gsply_reads_the_same(cloud, tmp_path):
+    gsply = pytest.importorskip("gsply")
+    write_ply(tmp_path / "a.ply", cloud)
+    other = gsply.plyread(tmp_path / "a.ply")
+    own = read_splats(tmp_path / "a.ply")
+    np.testing.assert_allclose(other.means, own.means, atol=1e-6)
+    np.testing.assert_allclose(other.quats[:, [1, 2, 3, 0]], own.rotations, atol=1e-6)
+    np.testing.assert_allclose(np.exp(other.scales), own.scales, atol=1e-6)
+    np.testing.assert_allclose(1.0 / (1.0 + np.exp(-other.opacities.ravel())), own.opacities, atol=1e-6)
+    np.testing.assert_allclose(np.concatenate([other.sh0[:, None], other.shN], axis=1), own.sh, atol=1e-6)
+    (tmp_path / "b.ply").write_bytes(gsply.compress_to_bytes(other))
+    gsply.write_spz(tmp_path / "c.spz", other)
+    for path in (tmp_path / "b.ply", tmp_path / "c.spz"):
+        read = read_splats(path)
+        order = np.linalg.norm(read.means[:, None] - own.means, axis=2).argmin(axis=1)
+        np.testing.assert_allclose(read.means, own.means[order], atol=3e-3)
+        np.testing.assert_allclose(read.covariances(), own.covariances()[order], rtol=0.2, atol=1e-4)
+        np.testing.assert_allclose(read.sh[:, 0], own.sh[order, 0], atol=0.05)
+
+
+def test_packed_files_name_the_extra(cloud, tmp_path):
+    try:
+        import gsply  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        pytest.skip("gsply is installed")
+    import gzip
+
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, 1, 0, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(20)))
+    with pytest.raises(MissingExtra, match=r"gsply.*\[splats\]"):
+        read_splats(tmp_path / "a.spz")
