@@ -16,6 +16,10 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
+#: A symmetric 3 x 3 matrix: xx, xy, xz, yy, yz, zz.
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
+
+
 vec12 = wp.types.vector(length=12, dtype=wp.float32)
 
 

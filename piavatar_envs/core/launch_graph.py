@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby, zip_longest
 from typing import Any, TypeVar
 
@@ -38,10 +39,36 @@ class Launch:
     section: int = 0  # index of the parallel section, from 1 on; 0 for launches in sequence
     branch: int = 0  # index of the branch within its section
 
+    @property
+    def name(self) -> str:
+        """Name of the kernel."""
+        return self.kernel.key
+
     def recorded(self, device: wp.Device) -> Callable[[], None]:
         """Return a callable that makes the launch; compiles the kernel if needed."""
         arguments = {"inputs": self.inputs, "outputs": self.outputs, "block_dim": self.block_dim}
         return wp.launch(self.kernel, self.dim, **arguments, device=device, record_cmd=True).launch
+
+
+@dataclass(frozen=True)
+class PairSort:
+    """A recorded stable sort of the first ``count`` pairs of two arrays by the lowest bits of their keys."""
+
+    keys: wp.array
+    values: wp.array
+    count: int
+    bits: int
+    section: int = 0
+    branch: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name beside those of kernels."""
+        return "sort_pairs"
+
+    def recorded(self, device: wp.Device) -> Callable[[], None]:
+        """Return a callable that sorts."""
+        return partial(wp.utils.radix_sort_pairs, self.keys, self.values, self.count, 0, self.bits)
 
 
 class LaunchGraph:
@@ -66,7 +93,7 @@ class LaunchGraph:
             raise ValueError(f"a condition of shape {condition.shape} and type {condition.dtype}; use (1,) int32")
         self.device = wp.get_device(device)
         self._condition = condition
-        self._launches: list[Launch] = []
+        self._launches: list[Launch | PairSort] = []
         self._recorded: list[Callable[[], None]] = []  # bound launches, the first of these
         self._graph: Any = None
         self._streams: list[wp.Stream] = []  # shared by all parallel sections
@@ -87,6 +114,26 @@ class LaunchGraph:
         if self._graph is not None:
             raise RuntimeError(f"cannot append {kernel.key} to a graph that has run; build a new one")
         self._launches.append(Launch(kernel, dim, list(inputs), list(outputs), block_dim))
+
+    def sort_pairs(self, keys: wp.array, values: wp.array, count: int, bits: int) -> None:
+        """Append a stable sort, in place, of the first ``count`` values by the lowest ``bits`` of their keys.
+
+        Args:
+            keys: uint32, ``2 count`` of them; the second half is a workspace.
+            values: int32, likewise.
+            count: number of pairs.
+            bits: of a key that count, 32 at most.
+
+        Raises:
+            RuntimeError: the graph has already run.
+            ValueError: an array is too short or of another type.
+        """
+        if self._graph is not None:
+            raise RuntimeError("cannot append sort_pairs to a graph that has run; build a new one")
+        for name, array, dtype in (("keys", keys, wp.uint32), ("values", values, wp.int32)):
+            if array.dtype is not dtype or array.size < 2 * count:
+                raise ValueError(f"{name} {array.dtype.__name__} of shape {array.shape}; give {2 * count} {dtype.__name__}")
+        self._launches.append(PairSort(keys, values, count, bits))
 
     def parallel(self, *branches: LaunchGraph) -> None:
         """Append graphs as parallel branches; launches appended later wait for all of them.
@@ -143,17 +190,17 @@ class LaunchGraph:
 
     @property
     def names(self) -> list[str]:
-        """Kernel names of the launches, in order."""
-        return [launch.kernel.key for launch in self._launches]
+        """Names of the launches, in order: of their kernels, or ``sort_pairs``."""
+        return [launch.name for launch in self._launches]
 
     @property
     def launches(self) -> list[tuple[str, Callable[[], None]]]:
-        """Kernel name and callable of every launch, in order; compiles all kernels."""
+        """Name and callable of every launch, in order; compiles all kernels."""
         self.compile()
         return list(zip(self.names, self._recorded, strict=True))
 
     @property
-    def unbound(self) -> list[Launch]:
+    def unbound(self) -> list[Launch | PairSort]:
         """Launches appended since the last :meth:`bind`, whose kernels may not be compiled yet."""
         return self._launches[len(self._recorded) :]
 
@@ -213,7 +260,7 @@ class LaunchGraph:
         else:
             wp.capture_if(self._condition, launch_all)
 
-    def _launch_section(self, launches: list[tuple[Launch, Callable[[], None]]]) -> None:
+    def _launch_section(self, launches: list[tuple[Launch | PairSort, Callable[[], None]]]) -> None:
         """Launch parallel branches, on a GPU on streams of their own, the last one on the graph's stream."""
         branches = [list(each) for _, each in groupby(launches, key=lambda pair: pair[0].branch)]
         own = self._streams_for(len(branches) - 1)
@@ -252,7 +299,8 @@ def compile_graphs(graphs: Iterable[LaunchGraph]) -> None:
     graphs = list(graphs)
     for graph in graphs:
         acquire(graph.device)
-    modules = {(new.kernel.module, each.device.alias, new.block_dim): None for each in graphs for new in each.unbound}
+    launches = [(each, new) for each in graphs for new in each.unbound if isinstance(new, Launch)]
+    modules = {(new.kernel.module, each.device.alias, new.block_dim): None for each, new in launches}
     pool = ThreadPoolExecutor(compiling_threads())
     try:
         loads = [pool.submit(load_module, module, wp.get_device(d), dim) for module, d, dim in modules]

@@ -168,3 +168,26 @@ def test_a_cache_that_cannot_be_written_is_named_with_the_remedy(tmp_path, monke
         written_by_its_own_module()
     assert "\n" not in str(caught.value)
     write_index.module.unload()
+
+
+@pytest.mark.parametrize("run", ["run", "run_eager"])
+@pytest.mark.parametrize("holds", [None, 0, 1])
+def test_sort_is_stable_and_looks_at_the_low_bits(device, run, holds):
+    condition = None if holds is None else wp.array([holds], dtype=int, device=device)
+    given = np.random.default_rng(0).integers(0, 2**32, 3000, dtype=np.uint32)
+    keys = wp.array(np.concatenate([given, 0 * given]), dtype=wp.uint32, device=device)
+    values = wp.array(np.concatenate([np.arange(3000), np.zeros(3000)]), dtype=int, device=device)
+    graph = LaunchGraph(device, condition)
+    graph.launch(double, 64, [wp.zeros(64, dtype=int, device=device), 0], block_dim=32)
+    graph.sort_pairs(keys, values, 3000, 8)
+    assert graph.names == ["double", "sort_pairs"]
+    getattr(graph, run)()
+    order = np.arange(3000) if holds == 0 else np.argsort(given & 255, kind="stable")
+    np.testing.assert_array_equal(values.numpy()[:3000], order)
+
+
+def test_sorts_of_wrong_arrays_are_refused(device):
+    graph, keys = LaunchGraph(device), wp.zeros(8, dtype=wp.uint32, device=device)
+    for count, values in ((5, wp.zeros(10, dtype=int, device=device)), (4, wp.zeros(8, dtype=float, device=device))):
+        with pytest.raises(ValueError, match="of shape"):
+            graph.sort_pairs(keys, values, count, 8)

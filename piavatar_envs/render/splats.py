@@ -1,0 +1,527 @@
+"""Drawing of 3D Gaussians in Warp, for many pictures at once, over the picture of the meshes.
+
+A Gaussian is projected by EWA splatting (Zwicker, Pfister, van Baar and Gross, "EWA volume splatting", 2001, eqs. 21 to
+26) and blended front to back as in Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian Splatting for Real-Time
+Radiance Field Rendering" (2023), eqs. 3 and 5. Splats are sorted by the depth of their centres, equals by their index, so
+that a picture does not depend on its place in a batch, nor on the schedule.
+
+Every launch and workspace has a size that is fixed when the painter is built. A GPU marks in a bit mask which of the
+sorted splats reach which tile of 16 x 16 pixels, instead of listing the pairs, whose number changes with the view:
+nothing can overflow. A CPU walks over the splats, and over the pixels of each.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.core.arrays import vec6
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render.raster import View
+
+wp.set_module_options({"enable_backward": False})
+
+#: Most spherical harmonics of a colour: those of degree 3.
+MAX_HARMONICS = 16
+#: Pixels along each side of a tile, whose threads are a CUDA block.
+TILE = 16
+#: Most pictures that are sorted together: their number and 27 bits of depth are a key.
+MAX_CHUNK = 32
+#: Of the splats that are drawn together, and of the masks [bytes].
+SPLAT_WORKSPACE, MASK_WORKSPACE = 2**28, 2**27
+#: Of a projected splat: its record, key and index, the latter two twice [bytes].
+_SPLAT_BYTES = 64
+_DEPTH_BITS = 27
+
+_TILE = wp.constant(TILE)
+_PIXELS_OF_TILE = wp.constant(TILE * TILE)
+_DEPTH_KEYS = wp.constant(wp.uint32(_DEPTH_BITS))
+# Depths from 1/8 m to 2^13 m have 16 exponents, so that their bits above those of the first need 27 bits.
+_NEAREST, _FURTHEST = wp.constant(0.125), wp.constant(8192.0)
+_NEAREST_BITS = wp.constant(wp.uint32(np.float32(0.125).view(np.uint32)))
+_LAST_KEY = wp.constant(wp.uint32(2**_DEPTH_BITS - 1))
+# Least distance of a centre from the eye [m], as in the reference implementation of Kerbl et al.
+_NEAR = wp.constant(0.2)
+# Variance that the reconstruction filter of a pixel adds [px^2].
+_LOW_PASS = wp.constant(0.3)
+# The projection is linearised at most this many half pictures from its axis.
+_WIDEST = wp.constant(1.3)
+_MAX_ALPHA, _MIN_ALPHA = wp.constant(0.99), wp.constant(1.0 / 255.0)
+_LOG_MIN_ALPHA = wp.constant(float(np.log(1.0 / 255.0)))
+# Transmittance below which nothing more is blended.
+_OPAQUE = wp.constant(1.0e-4)
+
+
+class Canvas(Protocol):
+    """Pictures of ``N`` cameras that splats are blended over."""
+
+    views: wp.array  # View, (N,)
+    color: wp.array  # vec3, sRGB in [0, 1], (N, H, W)
+    nearest: wp.array  # inverse depth [1/m], 0 where nothing is, (N, H, W)
+
+
+@wp.struct
+class Records:
+    """Projected splats of some pictures, sorted front to back, each array ``(pictures, splats)``."""
+
+    place: wp.array2d[wp.vec4]  # centre, half width and half height [px]; the latter are -1 out of sight
+    shape: wp.array2d[wp.vec4]  # inverse covariance xx, xy, yy [1/px^2], and ln(opacity)
+    tint: wp.array2d[wp.vec4]  # sRGB, and inverse depth [1/m]
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return __ffs((int)bits) - 1;
+#else
+return __builtin_ctz(bits);
+#endif
+""")
+def lowest_bit(bits: wp.uint32) -> int:
+    """Return the index of the lowest set bit; ``bits`` must not be 0."""
+    ...
+
+
+@wp.func
+def harmonic(k: int, d: wp.vec3) -> float:
+    """Return real spherical harmonic ``k`` of a unit vector, with the signs and the order of Kerbl et al. (2023)."""
+    x = d[0]
+    y = d[1]
+    z = d[2]
+    result = float(0.28209479177387814)
+    if k == 1:
+        result = -0.4886025119029199 * y
+    elif k == 2:
+        result = 0.4886025119029199 * z
+    elif k == 3:
+        result = -0.4886025119029199 * x
+    elif k == 4:
+        result = 1.0925484305920792 * x * y
+    elif k == 5:
+        result = -1.0925484305920792 * y * z
+    elif k == 6:
+        result = 0.31539156525252005 * (2.0 * z * z - x * x - y * y)
+    elif k == 7:
+        result = -1.0925484305920792 * x * z
+    elif k == 8:
+        result = 0.5462742152960396 * (x * x - y * y)
+    elif k == 9:
+        result = -0.5900435899266435 * y * (3.0 * x * x - y * y)
+    elif k == 10:
+        result = 2.890611442640554 * x * y * z
+    elif k == 11:
+        result = -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y)
+    elif k == 12:
+        result = 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
+    elif k == 13:
+        result = -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y)
+    elif k == 14:
+        result = 1.445305721320277 * z * (x * x - y * y)
+    elif k == 15:
+        result = -0.5900435899266435 * x * (x * x - 3.0 * y * y)
+    return result
+
+
+@wp.func
+def color_towards(harmonics: wp.array2d[wp.vec3], s: int, d: wp.vec3) -> wp.vec3:
+    """Return the colour of splat ``s`` seen along a unit vector of its rest frame, not negative."""
+    color = wp.vec3(0.5, 0.5, 0.5)
+    for k in range(harmonics.shape[1]):
+        color += harmonic(k, d) * harmonics[s, k]
+    return wp.vec3(wp.max(color[0], 0.0), wp.max(color[1], 0.0), wp.max(color[2], 0.0))
+
+
+@wp.func
+def quadratic_form(covariance: vec6, a: wp.vec3, b: wp.vec3) -> float:
+    """Return ``a^T C b`` of a symmetric matrix given as xx, xy, xz, yy, yz, zz."""
+    return (
+        a[0] * (covariance[0] * b[0] + covariance[1] * b[1] + covariance[2] * b[2])
+        + a[1] * (covariance[1] * b[0] + covariance[3] * b[1] + covariance[4] * b[2])
+        + a[2] * (covariance[2] * b[0] + covariance[4] * b[1] + covariance[5] * b[2])
+    )
+
+
+@wp.func
+def is_before(depth: float) -> bool:
+    """Return whether a depth [m] is one that is drawn; not that of a splat which is not a number."""
+    return depth > _NEAR and depth < _FURTHEST
+
+
+@wp.kernel
+def write_depth_keys(
+    # in
+    first: int,  # picture of row 0
+    views: wp.array[View],
+    means: wp.array2d[wp.vec3],  # [m], (N, S)
+    # out
+    keys: wp.array[wp.uint32],  # rows of S
+    values: wp.array[int],
+):
+    """Write the keys that sort the splats by picture and depth, beside their indices."""
+    row, s = wp.tid()
+    view = views[first + row]
+    depth = wp.dot(means[first + row, s] - view.eye, view.forward)
+    key = _LAST_KEY
+    if is_before(depth):
+        key = wp.cast(depth, wp.uint32) - _NEAREST_BITS
+    at = row * means.shape[1] + s
+    keys[at] = (wp.uint32(row) << _DEPTH_KEYS) + key
+    values[at] = s
+
+
+@wp.kernel
+def project_splats(
+    # in
+    first: int,
+    views: wp.array[View],
+    means: wp.array2d[wp.vec3],  # [m], (N, S)
+    covariances: wp.array2d[vec6],  # [m^2], (N, S)
+    turns: wp.array2d[wp.quat],  # from the rest frame to the world, (N, S)
+    opacities: wp.array[float],  # (S,)
+    harmonics: wp.array2d[wp.vec3],  # (S, K)
+    order: wp.array[int],  # indices of the sorted splats, rows of S
+    # out
+    records: Records,
+):
+    """Project the splats in their order; those out of sight cover no pixel."""
+    row, i = wp.tid()
+    picture = first + row
+    s = order[row * means.shape[1] + i]
+    view = views[picture]
+    offset = means[picture, s] - view.eye
+    depth = wp.dot(offset, view.forward)
+    opacity = opacities[s]
+    place = wp.vec4(0.0, 0.0, -1.0, -1.0)
+    shape = wp.vec4(0.0)
+    tint = wp.vec4(0.0)
+    if is_before(depth) and opacity >= _MIN_ALPHA:
+        inverse = 1.0 / depth
+        across = wp.dot(offset, view.right) * inverse
+        down = -wp.dot(offset, view.up) * inverse
+        half_width = 0.5 * float(view.width)
+        half_height = 0.5 * float(view.height)
+        widest = _WIDEST * half_width / view.focal
+        highest = _WIDEST * half_height / view.focal
+        # rows of the Jacobian of the projection (Zwicker 2001, eq. 24), in world axes
+        scale = view.focal * inverse
+        jx = scale * (view.right - wp.clamp(across, -widest, widest) * view.forward)
+        jy = -scale * (view.up + wp.clamp(down, -highest, highest) * view.forward)
+        covariance = covariances[picture, s]
+        xx = quadratic_form(covariance, jx, jx) + _LOW_PASS
+        xy = quadratic_form(covariance, jx, jy)
+        yy = quadratic_form(covariance, jy, jy) + _LOW_PASS
+        determinant = xx * yy - xy * xy
+        if determinant > 0.0 and determinant < 1.0e30:
+            # beyond this ellipse alpha is below its least value
+            reach = 2.0 * (wp.log(opacity) - _LOG_MIN_ALPHA)
+            place = wp.vec4(
+                half_width + view.focal * across,
+                half_height + view.focal * down,
+                wp.sqrt(reach * xx),
+                wp.sqrt(reach * yy),
+            )
+            shape = wp.vec4(yy / determinant, -xy / determinant, xx / determinant, wp.log(opacity))
+            towards = wp.quat_rotate_inv(turns[picture, s], wp.normalize(offset))
+            color = color_towards(harmonics, s, towards)
+            tint = wp.vec4(color[0], color[1], color[2], inverse)
+    records.place[row, i] = place
+    records.shape[row, i] = shape
+    records.tint[row, i] = tint
+
+
+@wp.func
+def covered(place: wp.vec4, width: int, height: int) -> wp.vec4i:
+    """Return first and last column, first and last row of the pixels whose centres a splat can reach."""
+    w = float(width)
+    h = float(height)
+    return wp.vec4i(
+        int(wp.ceil(wp.clamp(place[0] - place[2] - 0.5, 0.0, w))),
+        int(wp.floor(wp.clamp(place[0] + place[2] - 0.5, -1.0, w - 1.0))),
+        int(wp.ceil(wp.clamp(place[1] - place[3] - 0.5, 0.0, h))),
+        int(wp.floor(wp.clamp(place[1] + place[3] - 0.5, -1.0, h - 1.0))),
+    )
+
+
+@wp.func
+def alpha_at(place: wp.vec4, shape: wp.vec4, x: float, y: float) -> float:
+    """Return the opacity of a splat at a point of the picture (Kerbl et al. 2023, eq. 4); 0 below the least one."""
+    dx = x - place[0]
+    dy = y - place[1]
+    exponent = shape[3] - 0.5 * (shape[0] * dx * dx + shape[2] * dy * dy) - shape[1] * dx * dy
+    result = float(0.0)
+    if exponent >= _LOG_MIN_ALPHA:
+        result = wp.min(wp.exp(exponent), _MAX_ALPHA)
+    return result
+
+
+@wp.kernel
+def mark_tiles(
+    # in
+    place: wp.array2d[wp.vec4],
+    width: int,
+    height: int,
+    first_row: int,  # of tiles
+    # out
+    masks: wp.array3d[wp.uint32],  # (pictures, tiles, words of 32 sorted splats)
+):
+    """Set the bits of the splats that reach each tile of some rows of tiles."""
+    row, word = wp.tid()
+    tiles_across = (width + _TILE - 1) // _TILE
+    last_row = first_row + masks.shape[1] // tiles_across - 1
+    for tile in range(masks.shape[1]):
+        masks[row, tile, word] = wp.uint32(0)
+    for b in range(32):
+        i = 32 * word + b
+        if i < place.shape[1]:
+            pixels = covered(place[row, i], width, height)
+            if pixels[0] <= pixels[1] and pixels[2] <= pixels[3]:
+                for y in range(wp.max(pixels[2] // _TILE, first_row), wp.min(pixels[3] // _TILE, last_row) + 1):
+                    for x in range(pixels[0] // _TILE, pixels[1] // _TILE + 1):
+                        tile = (y - first_row) * tiles_across + x
+                        masks[row, tile, word] = masks[row, tile, word] | (wp.uint32(1) << wp.uint32(b))
+
+
+@wp.kernel
+def mark_words(
+    # in
+    masks: wp.array3d[wp.uint32],
+    # out
+    words: wp.array3d[wp.uint32],  # (pictures, tiles, words of 32 words)
+):
+    """Set the bits of the words that are not empty, so that a tile skips 1,024 splats at once."""
+    row, tile, at = wp.tid()
+    bits = wp.uint32(0)
+    for b in range(32):
+        word = 32 * at + b
+        if word < masks.shape[2] and masks[row, tile, word] != wp.uint32(0):
+            bits = bits | (wp.uint32(1) << wp.uint32(b))
+    words[row, tile, at] = bits
+
+
+@wp.kernel
+def blend_tiles(
+    # in
+    first: int,
+    width: int,
+    height: int,
+    first_row: int,
+    masks: wp.array3d[wp.uint32],
+    words: wp.array3d[wp.uint32],
+    records: Records,
+    # in, out
+    color: wp.array3d[wp.vec3],
+    nearest: wp.array3d[float],
+):
+    """Blend the splats of a tile over the picture, a pixel a thread and a tile a CUDA block."""
+    thread = wp.tid()
+    block = thread // _PIXELS_OF_TILE
+    row = block // masks.shape[1]
+    tile = block - row * masks.shape[1]
+    tiles_across = (width + _TILE - 1) // _TILE
+    # a warp has 8 x 4 pixels: few splats reach a part of them only
+    lane = thread % 32
+    warp = (thread // 32) % 8
+    x = _TILE * (tile % tiles_across) + 8 * (warp % 2) + lane % 8
+    y = _TILE * (first_row + tile // tiles_across) + 4 * (warp // 2) + lane // 8
+    if x < width and y < height:
+        picture = first + row
+        center = wp.vec2(float(x) + 0.5, float(y) + 0.5)
+        surface = nearest[picture, y, x]
+        light = wp.vec3(0.0)
+        transmittance = float(1.0)
+        depth = float(surface)
+        at = int(0)
+        while at < words.shape[2]:
+            some = words[row, tile, at]
+            while some != wp.uint32(0):
+                word = 32 * at + lowest_bit(some)
+                some = some & (some - wp.uint32(1))
+                bits = masks[row, tile, word]
+                while bits != wp.uint32(0):
+                    i = 32 * word + lowest_bit(bits)
+                    bits = bits & (bits - wp.uint32(1))
+                    place = records.place[row, i]
+                    if wp.abs(center[0] - place[0]) <= place[2] and wp.abs(center[1] - place[1]) <= place[3]:
+                        alpha = alpha_at(place, records.shape[row, i], center[0], center[1])
+                        if alpha > 0.0:
+                            tint = records.tint[row, i]
+                            left = transmittance * (1.0 - alpha)
+                            if tint[3] < surface or left < _OPAQUE:
+                                bits = wp.uint32(0)
+                                some = wp.uint32(0)
+                                at = words.shape[2]
+                            else:
+                                light += (transmittance * alpha) * wp.vec3(tint[0], tint[1], tint[2])
+                                if transmittance >= 0.5 and left < 0.5:
+                                    depth = tint[3]
+                                transmittance = left
+            at += 1
+        color[picture, y, x] = light + transmittance * color[picture, y, x]
+        nearest[picture, y, x] = depth
+
+
+@wp.kernel
+def blend_splats(
+    # in
+    first: int,
+    records: Records,
+    nearest: wp.array3d[float],
+    # out
+    light: wp.array3d[wp.vec4],  # colour, and transmittance: its negative where nothing more is blended
+    front: wp.array3d[float],  # inverse depth where half of the light is lost [1/m], 0 where it is not
+):
+    """Blend the splats of a picture one after another, a picture a thread."""
+    row = wp.tid()
+    height = light.shape[1]
+    width = light.shape[2]
+    for y in range(height):
+        for x in range(width):
+            light[row, y, x] = wp.vec4(0.0, 0.0, 0.0, 1.0)
+            front[row, y, x] = 0.0
+    for i in range(records.place.shape[1]):
+        place = records.place[row, i]
+        pixels = covered(place, width, height)
+        for y in range(pixels[2], pixels[3] + 1):
+            for x in range(pixels[0], pixels[1] + 1):
+                before = light[row, y, x]
+                if before[3] > 0.0:
+                    alpha = alpha_at(place, records.shape[row, i], float(x) + 0.5, float(y) + 0.5)
+                    if alpha > 0.0:
+                        tint = records.tint[row, i]
+                        left = before[3] * (1.0 - alpha)
+                        if tint[3] < nearest[first + row, y, x] or left < _OPAQUE:
+                            light[row, y, x] = wp.vec4(before[0], before[1], before[2], -before[3])
+                        else:
+                            share = before[3] * alpha
+                            light[row, y, x] = wp.vec4(
+                                before[0] + share * tint[0], before[1] + share * tint[1], before[2] + share * tint[2], left
+                            )
+                            if before[3] >= 0.5 and left < 0.5:
+                                front[row, y, x] = tint[3]
+
+
+@wp.kernel
+def lay_over(
+    # in
+    first: int,
+    light: wp.array3d[wp.vec4],
+    front: wp.array3d[float],
+    # in, out
+    color: wp.array3d[wp.vec3],
+    nearest: wp.array3d[float],
+):
+    """Lay the blended splats over the picture."""
+    row, y, x = wp.tid()
+    own = light[row, y, x]
+    picture = first + row
+    color[picture, y, x] = wp.vec3(own[0], own[1], own[2]) + wp.abs(own[3]) * color[picture, y, x]
+    if front[row, y, x] > 0.0:
+        nearest[picture, y, x] = front[row, y, x]
+
+
+class SplatPainter:
+    """Draws the same ``S`` Gaussians, moved, in each of ``N`` pictures.
+
+    Attributes:
+        means: centres [m], vec3 ``(N, S)``; to be written before each picture, as the next two.
+        covariances: xx, xy, xz, yy, yz, zz [m^2], ``(N, S)``.
+        turns: rotations from the frame of the colours to the world, ``(N, S)``.
+        opacities: in [0, 1], ``(S,)``.
+        harmonics: of the colours, vec3 ``(S, K)``, ``K`` of 1, 4, 9 or 16: ``0.5 + sum Y_k c_k``.
+    """
+
+    def __init__(
+        self,
+        opacities: np.ndarray,
+        harmonics: np.ndarray,
+        num_pictures: int,
+        height: int,
+        width: int,
+        device: str,
+        *,
+        motion: tuple[wp.array, wp.array, wp.array] | None = None,
+        tiled: bool | None = None,
+    ) -> None:
+        """Allocate all arrays.
+
+        Args:
+            opacities: of the splats, in [0, 1], shape ``(S,)``.
+            harmonics: coefficients of the colours, shape ``(S, K, 3)``.
+            num_pictures: ``N``.
+            height: of a picture [px].
+            width: of a picture [px].
+            device: to draw on.
+            motion: arrays to read means, covariances and turns from; by default own ones.
+            tiled: whether to draw by tiles; by default on a GPU.
+
+        Raises:
+            ValueError: shapes that do not fit together, or an opacity outside [0, 1].
+        """
+        count = len(opacities)
+        if np.shape(harmonics) not in [(count, k, 3) for k in (1, 4, 9, MAX_HARMONICS)] or count == 0:
+            raise ValueError(f"harmonics of shape {np.shape(harmonics)}; give ({count}, K, 3), K = 1, 4, 9 or 16")
+        if not ((np.asarray(opacities) >= 0.0) & (np.asarray(opacities) <= 1.0)).all():
+            raise ValueError(f"opacities from {np.min(opacities)} to {np.max(opacities)}; give them in [0, 1]")
+        self.num_pictures, self.height, self.width = num_pictures, height, width
+        self.device, self.num_splats = device, count
+        self.opacities = wp.array(np.asarray(opacities), dtype=float, device=device)
+        self.harmonics = wp.array(np.asarray(harmonics), dtype=wp.vec3, device=device)
+        rows = (num_pictures, count)
+        self.means, self.covariances, self.turns = motion or (
+            wp.zeros(rows, dtype=wp.vec3, device=device),
+            wp.zeros(rows, dtype=vec6, device=device),
+            wp.array(np.tile(np.float32([0, 0, 0, 1]), (*rows, 1)), dtype=wp.quat, device=device),
+        )
+        self.chunk = max(1, min(MAX_CHUNK, num_pictures, SPLAT_WORKSPACE // (_SPLAT_BYTES * count)))
+        self._keys = wp.zeros(2 * self.chunk * count, dtype=wp.uint32, device=device)
+        self._order = wp.zeros(2 * self.chunk * count, dtype=int, device=device)
+        self._records = Records()
+        for name in ("place", "shape", "tint"):
+            setattr(self._records, name, wp.zeros((self.chunk, count), dtype=wp.vec4, device=device))
+        self.tiled = wp.get_device(device).is_cuda if tiled is None else tiled
+        if self.tiled:
+            across, words = -(-width // TILE), -(-count // 32)
+            self.tile_rows = max(1, min(-(-height // TILE), MASK_WORKSPACE // (4 * words * across * self.chunk)))
+            shape = (self.chunk, self.tile_rows * across)
+            self._masks = wp.zeros((*shape, words), dtype=wp.uint32, device=device)
+            self._words = wp.zeros((*shape, -(-words // 32)), dtype=wp.uint32, device=device)
+        else:
+            shape = (self.chunk, height, width)
+            self._light = wp.zeros(shape, dtype=wp.vec4, device=device)
+            self._front = wp.zeros(shape, dtype=float, device=device)
+
+    def record(self, graph: LaunchGraph, canvas: Canvas) -> None:
+        """Append the launches that blend the splats over the pictures of a canvas.
+
+        ``canvas.nearest`` becomes the inverse depth of the splat that takes half of the light, where there is one.
+        """
+        for first in range(0, self.num_pictures, self.chunk):
+            rows = min(self.chunk, self.num_pictures - first)
+            splats = (rows, self.num_splats)
+            graph.launch(write_depth_keys, splats, [first, canvas.views, self.means], [self._keys, self._order])
+            bits = _DEPTH_BITS + (rows - 1).bit_length()
+            graph.sort_pairs(self._keys, self._order, rows * self.num_splats, bits)
+            motion = [self.means, self.covariances, self.turns, self.opacities, self.harmonics]
+            graph.launch(project_splats, splats, [first, canvas.views, *motion, self._order], [self._records])
+            if self.tiled:
+                self._record_tiles(graph, canvas, first, rows)
+            else:
+                blended = [self._light, self._front]
+                graph.launch(blend_splats, rows, [first, self._records, canvas.nearest], blended)
+                pixels = (rows, self.height, self.width)
+                graph.launch(lay_over, pixels, [first, *blended], [canvas.color, canvas.nearest])
+
+    def _record_tiles(self, graph: LaunchGraph, canvas: Canvas, first: int, rows: int) -> None:
+        size = [self.width, self.height]
+        tiles, words = self._masks.shape[1:]
+        for first_row in range(0, -(-self.height // TILE), self.tile_rows):
+            graph.launch(mark_tiles, (rows, words), [self._records.place, *size, first_row], [self._masks])
+            graph.launch(mark_words, (rows, tiles, self._words.shape[2]), [self._masks], [self._words])
+            graph.launch(
+                blend_tiles,
+                rows * tiles * TILE * TILE,
+                [first, *size, first_row, self._masks, self._words, self._records],
+                [canvas.color, canvas.nearest],
+                block_dim=TILE * TILE,
+            )

@@ -1,0 +1,197 @@
+"""Drawing of Gaussians: projection, order, blending with surfaces, colours, and rows of a batch."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+from scipy.special import sph_harm_y
+
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render import splats
+from piavatar_envs.render.raster import View
+from piavatar_envs.render.splats import SplatPainter
+
+HEIGHT, WIDTH, FOCAL = 44, 52, 60.0
+SH0 = 0.28209479177387814
+#: Looks along y, x to the right, z up.
+EYE, AXES = np.array([0.0, -3.0, 0.0]), np.eye(3)[[0, 2, 1]]
+
+
+def view(eye=EYE, axes=AXES, width=WIDTH, height=HEIGHT) -> View:
+    row = View()
+    row.eye, (row.right, row.up, row.forward) = wp.vec3(*eye), (wp.vec3(*axis) for axis in axes)
+    row.focal, row.width, row.height = FOCAL, width, height
+    return row
+
+
+def draw(device, views, means, covariances, colors, opacities, turns=None, background=0.2, nearest=0.0, tiled=None):
+    """Return colours and inverse depths of pictures; ``colors`` are ``(S, 3)``, or harmonics ``(S, K, 3)``."""
+    colors = np.asarray(colors, dtype=float)
+    harmonics = colors if colors.ndim == 3 else ((colors - 0.5) / SH0)[:, None]
+    painter = SplatPainter(opacities, harmonics, len(views), HEIGHT, WIDTH, device, tiled=tiled)
+    rows = (len(views), *np.shape(means)[-2:])
+    painter.means.assign(np.broadcast_to(means, rows))
+    packed = np.asarray(covariances)[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    painter.covariances.assign(np.broadcast_to(packed, (*rows[:2], 6)))
+    if turns is not None:
+        painter.turns.assign(np.broadcast_to(turns, (*rows[:2], 4)))
+    pictures = (len(views), HEIGHT, WIDTH)
+    canvas = SimpleNamespace(
+        views=wp.array(views, dtype=View, device=device),
+        color=wp.array(np.broadcast_to(np.float32(background), (*pictures, 3)), dtype=wp.vec3, device=device),
+        nearest=wp.array(np.broadcast_to(np.float32(nearest), pictures), dtype=float, device=device),
+    )
+    graph = LaunchGraph(device)
+    painter.record(graph, canvas)
+    graph.run()
+    return canvas.color.numpy(), canvas.nearest.numpy()
+
+
+def cloud(count: int, seed: int = 0):
+    rng = np.random.default_rng(seed)
+    means = rng.uniform([-1.2, -1.0, -1.0], [1.2, 1.0, 1.0], (count, 3))
+    axes = Rotation.random(count, random_state=seed).as_matrix() * rng.uniform(0.005, 0.15, (count, 1, 3))
+    return means, axes @ axes.transpose(0, 2, 1), rng.uniform(0, 1, (count, 3)), rng.uniform(0.0, 1.0, count)
+
+
+def reference(means, covariances, colors, opacities, background, nearest, eye=EYE, axes=AXES):
+    """Blend in float64, splat by splat."""
+    x, y, z = axes @ (means - eye).T
+    u, v = WIDTH / 2 + FOCAL * x / z, HEIGHT / 2 - FOCAL * y / z
+    light, rest = np.zeros((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH))
+    done = np.zeros((HEIGHT, WIDTH), bool)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for i in np.argsort(z.astype(np.float32), kind="stable"):
+        if z[i] < 0.2:
+            continue
+        wide, high = np.clip([x[i] / z[i], -y[i] / z[i]], *(np.outer([-1, 1], [WIDTH, HEIGHT]) * 0.65 / FOCAL))
+        jacobian = FOCAL / z[i] * np.array([axes[0] - wide * axes[2], -axes[1] - high * axes[2]])
+        shape = np.linalg.inv(jacobian @ covariances[i] @ jacobian.T + 0.3 * np.eye(2))
+        offset = np.stack([columns - u[i], rows - v[i]], axis=-1)
+        alpha = opacities[i] * np.exp(-0.5 * np.einsum("hwi,ij,hwj->hw", offset, shape, offset))
+        alpha = np.where(alpha < 1 / 255, 0.0, np.minimum(alpha, 0.99))
+        done |= (alpha > 0) & ((1 / z[i] < nearest) | (rest * (1 - alpha) < 1e-4))
+        alpha[done] = 0.0
+        light += (rest * alpha)[..., None] * colors[i]
+        rest *= 1 - alpha
+    return light + rest[..., None] * background
+
+
+def test_one_gaussian_is_its_analytic_image(device):
+    # A sphere of 0.2 m seen from 3 m at the axis: an isotropic Gaussian of (0.2 focal / 3)^2 + 0.3 px^2.
+    color, depth = draw(device, [view()], [[0, 0, 0]], [0.04 * np.eye(3)], [[1.0, 0.5, 0.0]], [0.8])
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    square = (rows - HEIGHT / 2) ** 2 + (columns - WIDTH / 2) ** 2
+    alpha = 0.8 * np.exp(-0.5 * square / ((0.2 * FOCAL / 3) ** 2 + 0.3))
+    alpha[alpha < 1 / 255] = 0.0
+    expected = alpha[..., None] * [1.0, 0.5, 0.0] + (1 - alpha[..., None]) * 0.2
+    np.testing.assert_allclose(color[0], expected, atol=1e-5)
+    assert alpha.min() == 0.0 < (depth > 0).mean() < 1.0
+    np.testing.assert_allclose(depth[0][alpha > 0.51], 1 / 3, rtol=1e-6)
+
+
+def test_many_gaussians_equal_a_slow_reference(device):
+    means, covariances, colors, opacities = cloud(700)
+    turn = Rotation.from_euler("zxy", [40, -20, 10], degrees=True)
+    eye, axes = turn.apply(EYE), turn.apply(AXES)
+    nearest = np.where(np.arange(WIDTH) < WIDTH // 2, 0.0, 1 / 3.1)
+    color, _ = draw(device, [view(eye, axes)], means, covariances, colors, opacities, nearest=nearest)
+    expected = reference(means, covariances, colors, opacities, 0.2, nearest, eye, axes)
+    np.testing.assert_allclose(color[0], expected, atol=1e-4)
+    assert np.abs(expected - 0.2).max(axis=-1).mean() > 0.1  # there is something to see
+
+
+def test_a_surface_hides_what_is_behind_it(device):
+    means, covariances = [[0, 0.5, 0], [0, -0.5, 0]], [0.09 * np.eye(3)] * 2
+    colors, opacities = [[1, 0, 0], [0, 1, 0]], [0.9, 0.6]
+    center = (0, HEIGHT // 2, WIDTH // 2)
+    for surface, hidden in ((1 / 4.0, ()), (1 / 3.0, (0,)), (1 / 2.0, (0, 1))):
+        color, depth = draw(device, [view()], means, covariances, colors, opacities, background=0.5, nearest=surface)
+        left = [i for i in range(2) if i not in hidden]
+        expected = reference(*(np.array(a)[left] for a in (means, covariances, colors, opacities)), 0.5, 0.0)
+        np.testing.assert_allclose(color[center], expected[center[1:]], atol=1e-5)
+        assert depth[center] == pytest.approx(1 / 2.5 if not hidden or hidden == (0,) else surface)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_harmonics_are_those_of_scipy(degree):
+    @wp.kernel
+    def evaluate(directions: wp.array[wp.vec3], values: wp.array2d[float]):
+        i, k = wp.tid()
+        values[i, k] = splats.harmonic(k, directions[i])
+
+    directions = np.random.default_rng(degree).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    values = wp.zeros((50, 16), dtype=float, device="cpu")
+    wp.launch(evaluate, values.shape, [wp.array(directions, dtype=wp.vec3, device="cpu")], [values], device="cpu")
+    polar, azimuth = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
+    for order in range(-degree, degree + 1):
+        # Real harmonics of complex ones that have the Condon-Shortley phase, which the convention keeps.
+        full = sph_harm_y(degree, abs(order), polar, azimuth)
+        part = full.real if order >= 0 else full.imag
+        expected = part * (np.sqrt(2.0) if order else 1.0)
+        np.testing.assert_allclose(values.numpy()[:, degree * (degree + 1) + order], expected, atol=2e-6)
+
+
+def test_colour_turns_with_the_splat(device):
+    # Degree 1: c_3 multiplies -x, so the colour is brightest seen along -x of the rest frame.
+    harmonics = np.zeros((1, 4, 3))
+    harmonics[0, 3] = 1.0
+    for degrees, expected in ((0, 0.5), (90, 0.5 - 0.48860251), (-90, 0.5 + 0.48860251)):
+        # the eye looks along y: turned by 90 degrees about z, that is along x of the rest frame
+        turn = Rotation.from_euler("z", degrees, degrees=True).as_quat()
+        given = ([[0, 0, 0]], [0.5 * np.eye(3)], harmonics, [0.99])
+        color, _ = draw(device, [view()], *given, turns=turn, background=0.0)
+        assert color[0, HEIGHT // 2, WIDTH // 2, 1] == pytest.approx(0.99 * expected, abs=2e-3)
+
+
+def test_opacity_has_limits(device):
+    def alpha(opacity, count=1):
+        given = (count * [[0, 0, 0]], count * [np.eye(3)], count * [[1, 1, 1]], count * [opacity])
+        return draw(device, [view()], *given, background=0.0)[0][0, HEIGHT // 2, WIDTH // 2, 0]
+
+    assert alpha(0.0) == alpha(0.9 / 255) == 0.0
+    assert alpha(1.1 / 255) == pytest.approx(1.1 / 255, rel=1e-3)
+    assert alpha(1.0) == pytest.approx(0.99)
+    assert alpha(1.0, 5) == pytest.approx(0.99)  # the second would leave less than 1e-4
+
+
+def test_what_is_not_a_number_or_out_of_sight_is_not_drawn(device):
+    means = [[np.nan, 0, 0], [0, 0, 0], [0, -3.1, 0], [0, -2.9, 0], [0, 9e3, 0], [0, 0, 0], [500.0, 0, 0]]
+    covariances = [np.eye(3), np.full((3, 3), np.nan), *(4 * [np.eye(3)]), 1e-4 * np.eye(3)]
+    opacities = [1, 1, 1, 1, 1, 0, 1]
+    color, depth = draw(device, [view()], means, covariances, 7 * [[1, 1, 1]], opacities, nearest=0.01)
+    assert (color == np.float32(0.2)).all() and (depth == np.float32(0.01)).all()
+
+
+def test_rows_of_a_batch_equal_single_pictures_and_a_second_run(device, equal, monkeypatch):
+    parts = cloud(300, seed=3)
+    means = np.stack([parts[0] + shift for shift in np.linspace(-0.3, 0.3, 5)])
+    means[:, 100:150] = means[:, 50:100]  # equal depths: the lower index is in front
+    views = [view(EYE + [0, 0.1 * i, 0]) for i in range(5)]
+    together = draw(device, views, means, *parts[1:])
+    for a, b in zip(together, draw(device, views, means, *parts[1:]), strict=True):
+        assert equal(a, b)
+    monkeypatch.setattr(splats, "SPLAT_WORKSPACE", 2 * 64 * 300)  # in chunks of two
+    monkeypatch.setattr(splats, "MASK_WORKSPACE", 1)  # in single rows of tiles
+    for a, b in zip(together, draw(device, views, means, *parts[1:]), strict=True):
+        assert equal(a, b)
+    for i in range(5):
+        for a, b in zip(together, draw(device, views[i : i + 1], means[i], *parts[1:]), strict=True):
+            assert equal(a[i], b[0])
+
+
+def test_tiles_and_splats_blend_the_same(device):
+    given = ([view(), view(1.1 * EYE)], *cloud(2200))  # more than a word of words
+    for a, b in zip(draw(device, *given, tiled=True), draw(device, *given, tiled=False), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-6)
+
+
+def test_wrong_clouds_are_refused():
+    for opacities, shape in (([0.5, 0.5], (2, 3)), ([0.5], (1, 2, 3)), ([], (0, 1, 3)), ([1.5], (1, 1, 3))):
+        with pytest.raises(ValueError, match="give"):
+            SplatPainter(opacities, np.zeros(shape), 1, 8, 8, "cpu")
