@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from piavatar_envs.core.arrays import vec6
+from piavatar_envs.core.arrays import vec6, vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render.raster import View
 
@@ -84,51 +84,41 @@ def lowest_bit(bits: wp.uint32) -> int:
 
 
 @wp.func
-def harmonic(k: int, d: wp.vec3) -> float:
-    """Return real spherical harmonic ``k`` of a unit vector, with the signs and the order of Kerbl et al. (2023)."""
+def harmonics_of(d: wp.vec3) -> vec16:
+    """Return the real spherical harmonics of a unit vector, with the signs and the order of Kerbl et al. (2023)."""
     x = d[0]
     y = d[1]
     z = d[2]
-    result = float(0.28209479177387814)
-    if k == 1:
-        result = -0.4886025119029199 * y
-    elif k == 2:
-        result = 0.4886025119029199 * z
-    elif k == 3:
-        result = -0.4886025119029199 * x
-    elif k == 4:
-        result = 1.0925484305920792 * x * y
-    elif k == 5:
-        result = -1.0925484305920792 * y * z
-    elif k == 6:
-        result = 0.31539156525252005 * (2.0 * z * z - x * x - y * y)
-    elif k == 7:
-        result = -1.0925484305920792 * x * z
-    elif k == 8:
-        result = 0.5462742152960396 * (x * x - y * y)
-    elif k == 9:
-        result = -0.5900435899266435 * y * (3.0 * x * x - y * y)
-    elif k == 10:
-        result = 2.890611442640554 * x * y * z
-    elif k == 11:
-        result = -0.4570457994644658 * y * (4.0 * z * z - x * x - y * y)
-    elif k == 12:
-        result = 0.3731763325901154 * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y)
-    elif k == 13:
-        result = -0.4570457994644658 * x * (4.0 * z * z - x * x - y * y)
-    elif k == 14:
-        result = 1.445305721320277 * z * (x * x - y * y)
-    elif k == 15:
-        result = -0.5900435899266435 * x * (x * x - 3.0 * y * y)
-    return result
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    return vec16(
+        0.28209479177387814,
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2.0 * zz - xx - yy),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (xx - yy),
+        -0.5900435899266435 * y * (3.0 * xx - yy),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4.0 * zz - xx - yy),
+        0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        -0.4570457994644658 * x * (4.0 * zz - xx - yy),
+        1.445305721320277 * z * (xx - yy),
+        -0.5900435899266435 * x * (xx - 3.0 * yy),
+    )
 
 
 @wp.func
 def color_towards(harmonics: wp.array2d[wp.vec3], s: int, d: wp.vec3) -> wp.vec3:
     """Return the colour of splat ``s`` seen along a unit vector of its rest frame, not negative."""
     color = wp.vec3(0.5, 0.5, 0.5)
+    values = harmonics_of(d)
     for k in range(harmonics.shape[1]):
-        color += harmonic(k, d) * harmonics[s, k]
+        color += values[k] * harmonics[s, k]
     return wp.vec3(wp.max(color[0], 0.0), wp.max(color[1], 0.0), wp.max(color[2], 0.0))
 
 

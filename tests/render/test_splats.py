@@ -10,6 +10,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
+from piavatar_envs.core.arrays import vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render import splats
 from piavatar_envs.render.raster import View
@@ -120,14 +121,14 @@ def test_a_surface_hides_what_is_behind_it(device):
 @pytest.mark.parametrize("degree", range(4))
 def test_harmonics_are_those_of_scipy(degree):
     @wp.kernel
-    def evaluate(directions: wp.array[wp.vec3], values: wp.array2d[float]):
-        i, k = wp.tid()
-        values[i, k] = splats.harmonic(k, directions[i])
+    def evaluate(directions: wp.array[wp.vec3], values: wp.array[vec16]):
+        i = wp.tid()
+        values[i] = splats.harmonics_of(directions[i])
 
     directions = np.random.default_rng(degree).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    values = wp.zeros((50, 16), dtype=float, device="cpu")
-    wp.launch(evaluate, values.shape, [wp.array(directions, dtype=wp.vec3, device="cpu")], [values], device="cpu")
+    values = wp.zeros(50, dtype=vec16, device="cpu")
+    wp.launch(evaluate, 50, [wp.array(directions, dtype=wp.vec3, device="cpu")], [values], device="cpu")
     polar, azimuth = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
     for order in range(-degree, degree + 1):
         # Real harmonics of complex ones that have the Condon-Shortley phase, which the convention keeps.
