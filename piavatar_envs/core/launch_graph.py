@@ -132,7 +132,8 @@ class LaunchGraph:
             raise RuntimeError("cannot append sort_pairs to a graph that has run; build a new one")
         for name, array, dtype in (("keys", keys, wp.uint32), ("values", values, wp.int32)):
             if array.dtype is not dtype or array.size < 2 * count:
-                raise ValueError(f"{name} {array.dtype.__name__} of shape {array.shape}; give {2 * count} {dtype.__name__}")
+                given = f"{array.dtype.__name__} of shape {array.shape}"
+                raise ValueError(f"{name} {given}; give {2 * count} {dtype.__name__}")
         self._launches.append(PairSort(keys, values, count, bits))
 
     def parallel(self, *branches: LaunchGraph) -> None:

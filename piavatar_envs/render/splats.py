@@ -1,9 +1,9 @@
 """Drawing of 3D Gaussians in Warp, for many pictures at once, over the picture of the meshes.
 
-A Gaussian is projected by EWA splatting (Zwicker, Pfister, van Baar and Gross, "EWA volume splatting", 2001, eqs. 21 to
-26) and blended front to back as in Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian Splatting for Real-Time
-Radiance Field Rendering" (2023), eqs. 3 and 5. Splats are sorted by the depth of their centres, equals by their index, so
-that a picture does not depend on its place in a batch, nor on the schedule.
+A Gaussian is projected by EWA splatting (Zwicker, Pfister, van Baar and Gross, "EWA volume splatting", 2001) and blended
+front to back as in Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian splatting for real-time radiance field
+rendering", ACM Trans. Graph. 42 (2023), eqs. 3 to 5. Splats are sorted by the depth of their centres, equals by their
+index, so that a picture does not depend on its place in a batch, nor on the schedule.
 
 Every launch and workspace has a size that is fixed when the painter is built. A GPU marks in a bit mask which of the
 sorted splats reach which tile of 16 x 16 pixels, instead of listing the pairs, whose number changes with the view:
@@ -193,7 +193,7 @@ def project_splats(
         half_height = 0.5 * float(view.height)
         widest = _WIDEST * half_width / view.focal
         highest = _WIDEST * half_height / view.focal
-        # rows of the Jacobian of the projection (Zwicker 2001, eq. 24), in world axes
+        # rows of the Jacobian of the projection (Kerbl et al. 2023, eq. 5), in world axes
         scale = view.focal * inverse
         jx = scale * (view.right - wp.clamp(across, -widest, widest) * view.forward)
         jy = -scale * (view.up + wp.clamp(down, -highest, highest) * view.forward)
@@ -385,7 +385,10 @@ def blend_splats(
                         else:
                             share = before[3] * alpha
                             light[row, y, x] = wp.vec4(
-                                before[0] + share * tint[0], before[1] + share * tint[1], before[2] + share * tint[2], left
+                                before[0] + share * tint[0],
+                                before[1] + share * tint[1],
+                                before[2] + share * tint[2],
+                                left,
                             )
                             if before[3] >= 0.5 and left < 0.5:
                                 front[row, y, x] = tint[3]
