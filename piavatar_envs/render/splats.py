@@ -1,9 +1,9 @@
 """Drawing of 3D Gaussians in Warp, for many pictures at once, over the picture of the meshes.
 
-A Gaussian is projected by EWA splatting (Zwicker, Pfister, van Baar and Gross, "EWA volume splatting", 2001) and blended
-front to back as in Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian splatting for real-time radiance field
-rendering", ACM Trans. Graph. 42 (2023), eqs. 3 to 5. Splats are sorted by the depth of their centres, equals by their
-index, so that a picture does not depend on its place in a batch, nor on the schedule.
+A Gaussian is projected by EWA splatting (Zwicker, Pfister, van Baar and Gross, "EWA volume splatting", 2001) and
+blended front to back as in Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian splatting for real-time radiance
+field rendering", ACM Trans. Graph. 42 (2023), eqs. 3 to 5. Splats are sorted by the depth of their centres, equals by
+their index, so that a picture does not depend on its place in a batch, nor on the schedule.
 
 Every launch and workspace has a size that is fixed when the painter is built. A GPU marks in a bit mask which of the
 sorted splats reach which tile of 16 x 16 pixels, instead of listing the pairs, whose number changes with the view:
