@@ -116,11 +116,8 @@ def draw(asset: AvatarAsset, path: Path) -> None:
 
     body = asset.mean_body()
     shift = body.vertices[0].astype(np.float64) - asset.vertices[0]
-    look = asset.look
-    if look is None:
-        surface = Body(body.vertices, asset.faces)
-    else:
-        surface = Body((look.vertices + shift).astype(np.float32), look.faces, colors=look.colors)
+    look = asset.drawn
+    surface = Body((look.vertices + shift).astype(np.float32), look.faces, colors=look.colors_of(0))
     joints = body.joints.astype(np.float64)
     bones = [_bone(joints[PARENTS[joint]], joints[joint], Capsule) for joint in range(1, len(JOINT_NAMES))]
     skeleton = [*bones, *(Sphere(joint, _JOINT) for joint in joints)]

@@ -131,7 +131,7 @@ class SceneReader:
                 F = matrices_of(simulation.state.F.numpy()[env])
                 scalars = skin.interpolate(strain_magnitude(F[own]))
             drawn, color_of_all = flesh.asset.drawn, PALETTE[index % len(PALETTE)]
-            bodies.append(Body(vertices, drawn.faces, color_of_all, drawn.colors, scalars=scalars))
+            bodies.append(Body(vertices, drawn.faces, color_of_all, drawn.colors_of(index), scalars=scalars))
         return bodies
 
     def _props(self, env: int, x: np.ndarray) -> list[Body]:

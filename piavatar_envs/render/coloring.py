@@ -168,7 +168,7 @@ def _split(body: Body) -> _Split:
     key = (id(body.colors), id(body.faces))
     if key not in _splits:
         triangles = np.asarray(body.colors, np.float64)[body.faces].mean(axis=1) / 255.0
-        palette = np.unique(np.rint(triangles * 255.0), axis=0) / 255.0
+        palette = np.unique(body.colors, axis=0) / 255.0
         if len(palette) > NUM_BANDS:
             chosen = triangles[np.linspace(0, len(triangles) - 1, 4096).astype(int)]
             palette = np.unique(kmeans2(chosen, NUM_BANDS, minit="++", seed=0)[0], axis=0)

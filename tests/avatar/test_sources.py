@@ -113,7 +113,7 @@ def test_shapes_of_one_source_are_drawn_under_its_own_names(device):
 def test_pictures_show_the_look_in_its_colours_unless_a_quantity_is_asked_for(device):
     pytest.importorskip("pyvista")
     asset = load_asset()
-    green = np.tile(np.array([[30, 200, 40]], np.uint8), (len(asset.vertices), 1))
+    green = np.tile(np.array([[30, 200, 40]], np.uint8), (len(asset.drawn.vertices), 1))
     looks = dataclasses.replace(asset, look=dataclasses.replace(asset.drawn, colors=green))
     piavatar_envs.register_source("green", lambda: looks)
     counts = []
@@ -127,7 +127,7 @@ def test_pictures_show_the_look_in_its_colours_unless_a_quantity_is_asked_for(de
 
 
 def test_the_look_of_a_shape_stands_where_its_skin_does():
-    asset = load_asset()
+    asset = load_asset(appearance="skin")
     raised = dataclasses.replace(asset.drawn, vertices=asset.vertices + np.float32(0.05))
     dressed = dataclasses.replace(asset, look=raised)
     parameters = asset.parameters(height=0.7, weight=-0.4)

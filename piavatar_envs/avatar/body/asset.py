@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -60,7 +61,8 @@ class Look:
         faces: triangles, shape ``(U, 3)`` int32; only their fronts are drawn.
         skin_joints: joints that move each vertex, shape ``(W, 4)`` int32.
         skin_weights: their weights, descending, rows sum to one, shape ``(W, 4)`` float32.
-        colors: sRGB of the vertices, shape ``(W, 3)`` uint8, or None for the one colour of the avatar.
+        colors: sRGB of the vertices, shape ``(W, 3)`` uint8, or ``(K, W, 3)`` for ``K`` colourings that the avatars of
+            a scene have in turn; None for the one colour of the avatar.
         shape_deltas: displacements as those of the skin [m], shape ``(S, 2, W, 3)`` float32.
         pose: displacements that depend on the pose, if the file has such.
     """
@@ -72,6 +74,14 @@ class Look:
     colors: np.ndarray | None
     shape_deltas: np.ndarray
     pose: PoseDisplacements | None = None
+
+    def colors_of(self, avatar: int) -> np.ndarray | None:
+        """Return the colours of the avatar of an index in its scene, ``(W, 3)``; on each call the same array."""
+        return None if self.colors is None else self._colorings[avatar % len(self._colorings)]
+
+    @cached_property
+    def _colorings(self) -> tuple[np.ndarray, ...]:
+        return (self.colors,) if self.colors.ndim == 2 else tuple(self.colors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +115,7 @@ class AvatarAsset:
         shape_deltas: vertex displacements at -1 and at +1 of each parameter [m], shape ``(S, 2, V, 3)`` float32.
         shape_joints: joint displacements, the same way [m], shape ``(S, 2, 22, 3)`` float32.
         look: the surface to draw; None draws the skin.
+        outfit: makes the look from the asset when that is first drawn, where ``look`` is None.
         skeleton: where bone particles are put; None puts them around the bones' axes.
         groups: weights in [0, 1] of the vertices in groups that the file names, each shape ``(V,)`` float32.
     """
@@ -119,6 +130,7 @@ class AvatarAsset:
     shape_deltas: np.ndarray
     shape_joints: np.ndarray
     look: Look | None = None
+    outfit: Callable[[AvatarAsset], Look] | None = None
     skeleton: SkeletonPoints | None = None
     groups: Mapping[str, np.ndarray] = field(default_factory=dict)
 
@@ -131,11 +143,13 @@ class AvatarAsset:
         vertices, joints, origin = self._shaped(parameters)
         return ShapedBody((vertices - origin).astype(np.float32), (joints - origin).astype(np.float32))
 
-    @property
+    @cached_property
     def drawn(self) -> Look:
-        """The surface to draw: the look, or the skin in one colour."""
+        """The surface to draw: the look, that of the outfit, or the skin in one colour."""
         if self.look is not None:
             return self.look
+        if self.outfit is not None:
+            return self.outfit(self)
         return Look(self.vertices, self.faces, self.skin_joints, self.skin_weights, None, self.shape_deltas)
 
     def shape_drawn(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:

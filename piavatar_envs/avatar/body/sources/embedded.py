@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from importlib import resources
+from typing import Literal
 
 import numpy as np
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights
+from piavatar_envs.avatar.body.outfit import dressed
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.body.skeleton_mesh import read_skeleton
 
@@ -19,11 +21,12 @@ def _merged_into_body(parents: np.ndarray) -> np.ndarray:
     return body
 
 
-def build(skeleton: str | None = None) -> AvatarAsset:
+def build(skeleton: str | None = None, appearance: Literal["clothed", "skin"] = "clothed") -> AvatarAsset:
     """Return the embedded body.
 
     Args:
         skeleton: mesh of a skeleton, or a folder of its parts, in the body's place, pose and axes; for bone particles.
+        appearance: in pictures: in shirt, shorts and shoes, each avatar of a scene in colours of its own, or bare.
 
     Raises:
         ValueError: the file has another skeleton, or that of ``skeleton`` cannot be read.
@@ -48,5 +51,6 @@ def build(skeleton: str | None = None) -> AvatarAsset:
         shape_names=names,
         shape_deltas=deltas.reshape(len(names), 2, *deltas.shape[1:]),
         shape_joints=data["shape_joints"][:, :NUM_JOINTS].reshape(len(names), 2, NUM_JOINTS, 3),
+        outfit=dressed if appearance == "clothed" else None,
         skeleton=None if skeleton is None else read_skeleton(skeleton, data["joints"][:NUM_JOINTS].astype(np.float64)),
     )
