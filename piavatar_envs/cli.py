@@ -1,4 +1,4 @@
-"""The command line: ``python -m piavatar_envs list | doctor | inspect | play | watch``.
+"""The command line: ``python -m piavatar_envs list | doctor | inspect | play | watch | export``.
 
 Each command imports its own modules, so that ``--help`` is quick.
 """
@@ -144,6 +144,49 @@ def watch_command(
     watch.watch(env_id, agent, seed, device, port, prepare(env_id, config, avatar))
 
 
+def export_command(
+    env_id: EnvId,
+    out: Annotated[Path, tyro.conf.arg(help="folder to write to, new or empty")] = Path("export"),
+    format: Annotated[
+        Literal["glb", "ply", "usd"],
+        tyro.conf.arg(help="one animated glTF file, a file for each mesh and frame, or USD (needs the extra usd)"),
+    ] = "glb",
+    agent: AgentName = "random",
+    steps: Annotated[
+        int | None, tyro.conf.arg(help="steps to play, over as many episodes; default one episode")
+    ] = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
+    color: Annotated[
+        Literal["skin", "strain"], tyro.conf.arg(help="colour of the bodies; strain for ply and usd")
+    ] = "skin",
+    avatar: AvatarFile = None,
+    config: Overrides = (),
+) -> None:
+    """Play an environment and write its meshes, frame by frame, for Blender and other programs.
+
+    Args:
+        env_id: the environment, e.g. PIAvatar/Reach-v0.
+        out: folder of the files.
+        format: of the files.
+        agent: random or zero actions.
+        steps: number of steps.
+        seed: seed of the run.
+        device: where to simulate.
+        color: skin or strain.
+        avatar: the body, instead of the package's own.
+        config: overrides of the environment's configuration.
+    """
+    from piavatar_envs import export
+
+    overrides = prepare(env_id, config, avatar)
+    rollout, paths = export.export(env_id, out, format, agent, steps, seed, device, color, overrides)
+    for path in paths:
+        print(path)
+    if rollout.interrupted:
+        raise KeyboardInterrupt(f"after {rollout.steps} steps, exported to {out}")
+
+
 def prepare(env_id: str, config: tuple[str, ...], avatar: Path | None = None) -> dict[str, Any]:
     """Check the id, silence Warp, and return the settings, with those of the source of a character's file.
 
@@ -252,6 +295,7 @@ def main(args: list[str] | None = None) -> None:
         "inspect": inspect_command,
         "play": play_command,
         "watch": watch_command,
+        "export": export_command,
     }
     try:
         tyro.extras.subcommand_cli_from_dict(

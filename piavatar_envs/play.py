@@ -72,8 +72,7 @@ def play(
             seed or a setting out of range.
     """
     check_agent(agent, seed)
-    if steps is not None and steps < 1:
-        raise ValueError(f"steps={steps} must be >= 1")
+    check_steps(steps)
     if video is not None:  # before the kernels are compiled
         check_suffix(video)
         check_writable(video)
@@ -83,11 +82,11 @@ def play(
     env = make(env_id, settings)
     rollout = Rollout()
     try:
-        frames = _frames(env, agent, steps, seed, rollout)
+        pictures = frames(env, agent, steps, seed, rollout)
         if video is None:
-            deque(frames, maxlen=0)
+            deque(pictures, maxlen=0)
         else:
-            write_video(video, frames, env.metadata["render_fps"])
+            write_video(video, pictures, env.metadata["render_fps"])
     finally:
         env.close()
     return rollout
@@ -102,6 +101,16 @@ def check_agent(agent: str, seed: int) -> None:
     if agent not in ("random", "zero"):
         raise ValueError(f"no agent {agent!r}; there are random and zero")
     check_seeds(seed)
+
+
+def check_steps(steps: int | None) -> None:
+    """Refuse a number of steps below 1; None stands for one episode.
+
+    Raises:
+        ValueError: it is below 1.
+    """
+    if steps is not None and steps < 1:
+        raise ValueError(f"steps={steps} must be >= 1")
 
 
 def settings_of(device: str, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -169,7 +178,7 @@ class JointEnv:
         self.env.close()
 
 
-def _frames(env: gymnasium.Env | JointEnv, agent: str, steps: int | None, seed: int, rollout: Rollout) -> Iterator[Any]:
+def frames(env: gymnasium.Env | JointEnv, agent: str, steps: int | None, seed: int, rollout: Rollout) -> Iterator[Any]:
     """Play, add to ``rollout``, and yield a picture of each state (None without a render mode)."""
     env.action_space.seed(seed)
     still = np.zeros(env.action_space.shape, dtype=env.action_space.dtype)

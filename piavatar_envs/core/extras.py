@@ -17,6 +17,7 @@ EXTRAS = {
     "rsl": ("rsl_rl", "tensordict", "torch"),
     "live": ("viser",),
     "splats": ("gsply",),
+    "usd": ("pxr",),
     "bench": ("mujoco",),
     "dev": ("pytest", "xdist", "build"),
 }

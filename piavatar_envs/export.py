@@ -1,0 +1,132 @@
+"""Export of environments as geometry, for Blender and other programs: meshes that move, frame by frame.
+
+A recording is of any environment of the suite, whatever chooses its actions::
+
+    recording = Recording(env)
+    for _ in range(100):
+        env.step(policy(observation))
+        recording.add()
+    recording.write(Path("reach"), "glb")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from piavatar_envs.api.pictures import SceneReader
+from piavatar_envs.core.writing import check_writable
+from piavatar_envs.play import Rollout, check_agent, check_steps, frames, make, settings_of
+from piavatar_envs.render.film import Film
+from piavatar_envs.render.film_files import check_format, write_film
+
+
+class Recording:
+    """The scenes of one environment in time.
+
+    Attributes:
+        film: the meshes so far.
+    """
+
+    def __init__(self, env: Any, index: int = 0, color: Literal["skin", "strain"] = "skin") -> None:
+        """Begin without a frame.
+
+        Args:
+            env: an environment of the suite, of one agent or several, or a vector of environments.
+            index: which one of a vector.
+            color: of the bodies.
+
+        Raises:
+            ValueError: there is no such environment.
+        """
+        batch = env.unwrapped.batch
+        if not 0 <= index < batch.num_envs:
+            raise ValueError(f"index={index} is outside [0, {batch.num_envs - 1}]")
+        self._scenes, self._index, self._color = SceneReader(batch), index, color
+        self.film = Film(1.0 / batch.config.physics.control_dt)
+
+    def add(self) -> None:
+        """Append what there is to see now, as the next frame: one a step in real time."""
+        self.film.add(self._scenes.scene(self._index, self._color))
+
+    def write(self, folder: Path, kind: str) -> list[Path]:
+        """Write what was recorded, see :func:`piavatar_envs.render.film_files.write_film`.
+
+        Args:
+            folder: new, or empty.
+            kind: "glb", "ply" or "usd".
+
+        Returns:
+            The files, or the folders of files.
+
+        Raises:
+            ImportError: usd-core is not installed, for USD.
+            ValueError: the folder holds something, there is no frame, or the format is unknown or cannot hold it.
+        """
+        check_folder(folder)
+        return write_film(self.film, folder, kind)
+
+
+def export(
+    env_id: str,
+    folder: Path,
+    kind: str = "glb",
+    agent: str = "random",
+    steps: int | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    color: Literal["skin", "strain"] = "skin",
+    overrides: Mapping[str, Any] | None = None,
+) -> tuple[Rollout, list[Path]]:
+    """Play ``env_id`` as :func:`piavatar_envs.play.play` does, and write every state as a frame.
+
+    Ctrl-C ends it early, and what was played is written.
+
+    Args:
+        env_id: a registered id, or a module of several agents, with or without its package.
+        folder: to write to, new or empty.
+        kind: "glb", "ply" or "usd".
+        agent: "random" (uniform in the action space) or "zero".
+        steps: number of steps; one episode by default.
+        seed: of the first reset and of the random actions.
+        device: a Warp device.
+        color: of the bodies.
+        overrides: settings of the environment's configuration.
+
+    Returns:
+        The rollout, and the files or folders of files.
+
+    Raises:
+        ImportError: usd-core is not installed, for USD.
+        ValueError: an unknown module, agent or format, a folder that holds something, colours that the format cannot
+            hold, a number of steps below 1, a seed or a setting out of range.
+    """
+    check_agent(agent, seed)
+    check_steps(steps)
+    check_format(kind)
+    check_folder(folder)
+    if color != "skin" and kind == "glb":
+        raise ValueError(f"color={color} changes with time, which glTF cannot hold; use --format ply or usd")
+    env = make(env_id, settings_of(device, overrides))
+    rollout = Rollout()
+    try:
+        recording = Recording(env, color=color)
+        for _ in frames(env, agent, steps, seed, rollout):
+            recording.add()
+    finally:
+        env.close()
+    return rollout, recording.write(folder, kind)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that holds something, or that cannot be made.
+
+    Raises:
+        ValueError: it is such a folder, or a file.
+    """
+    if folder.is_file():
+        raise ValueError(f"{folder} is a file; name a folder")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ValueError(f"{folder} is not empty, and frames of two films would mix; name a new folder")
+    check_writable(folder / "film")

@@ -1,0 +1,119 @@
+"""Films as geometry: the meshes of a series of scenes, each with its shapes in time (NumPy)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from piavatar_envs.render.coloring import color_by
+from piavatar_envs.render.geometry import drawable
+from piavatar_envs.render.scene import Body, Marker, Scene
+
+
+@dataclass(eq=False)
+class Moving:
+    """A mesh whose vertices move.
+
+    Attributes:
+        name: a valid name of a file, and of a prim in USD.
+        faces: outward oriented triangles, shape ``(T, 3)`` int.
+        shapes: vertices [m] in each frame, shape ``(V, 3)`` float32, or None where it is not there.
+        colors: sRGB of the vertices in each frame, shape ``(V, 3)`` uint8; equal ones are the same array.
+    """
+
+    name: str
+    faces: np.ndarray
+    shapes: list[np.ndarray | None] = field(default_factory=list)
+    colors: list[np.ndarray | None] = field(default_factory=list)
+
+    @property
+    def first(self) -> int:
+        """The first frame in which it is there."""
+        return next(frame for frame, shape in enumerate(self.shapes) if shape is not None)
+
+    @property
+    def repaints(self) -> bool:
+        """Whether its colours change."""
+        return any(color is not None and color is not self.colors[self.first] for color in self.colors)
+
+    def held(self) -> list[np.ndarray]:
+        """Return the shapes with that of the frame before, or of the first one, where it is not there."""
+        shapes, last = [], self.shapes[self.first]
+        for shape in self.shapes:
+            last = last if shape is None else shape
+            shapes.append(last)
+        return shapes
+
+    def append(self, frame: int, shape: np.ndarray, color: np.ndarray) -> None:
+        """Add its shape and its colours in a frame; it was not there in those that were left out."""
+        missing = frame - len(self.shapes)
+        last = next((kept for kept in reversed(self.colors) if kept is not None), None)
+        if last is not None and np.array_equal(last, color):
+            color = last
+        self.shapes += [*(missing * [None]), drawable(shape)]
+        self.colors += [*(missing * [None]), color]
+
+
+class Film:
+    """Scenes in time.
+
+    Attributes:
+        rate: frames a second [1/s].
+        num_frames: number of scenes so far.
+    """
+
+    def __init__(self, rate: float) -> None:
+        """Begin without scenes.
+
+        Raises:
+            ValueError: the rate is not positive.
+        """
+        if not rate > 0.0:
+            raise ValueError(f"rate={rate} must be positive: it is the frames of a second")
+        self.rate = rate
+        self.num_frames = 0
+        self._meshes: dict[tuple[str, int, bytes], Moving] = {}
+
+    def add(self, scene: Scene) -> None:
+        """Append a frame.
+
+        A mesh goes on that has the same place in the scene and the same triangles; another one begins anew.
+        """
+        for name, vertices, faces, color in _meshes(scene):
+            key = (name, len(vertices), np.ascontiguousarray(faces).tobytes())
+            if key not in self._meshes:
+                others = sum(other[0] == name for other in self._meshes)
+                self._meshes[key] = Moving(f"{name}_{others}" if others else name, np.asarray(faces))
+            self._meshes[key].append(self.num_frames, vertices, color)
+        self.num_frames += 1
+
+    @property
+    def meshes(self) -> list[Moving]:
+        """What there is to see, in all frames."""
+        for mesh in self._meshes.values():
+            missing = self.num_frames - len(mesh.shapes)
+            mesh.shapes += missing * [None]
+            mesh.colors += missing * [None]
+        return list(self._meshes.values())
+
+
+def _meshes(scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield name, vertices, triangles and colours of everything in a scene; names persist between scenes."""
+    for index, body in enumerate(scene.bodies):
+        yield f"body_{index}", body.vertices, body.faces, _colors_of(body)
+    for index, marker in enumerate(scene.markers):
+        vertices, faces = marker.mesh()
+        yield f"{type(marker).__name__.lower()}_{index}", vertices, faces, _colors_of(marker, len(vertices))
+
+
+def _colors_of(thing: Body | Marker, count: int = 0) -> np.ndarray:
+    """Return the colours of the vertices, shape ``(V, 3)`` uint8."""
+    if isinstance(thing, Body):
+        count = len(thing.vertices)
+        if thing.scalars is not None:
+            return np.rint(255.0 * color_by(thing.scalars, thing.scalar_max)).astype(np.uint8)
+        if thing.colors is not None:
+            return np.asarray(thing.colors, dtype=np.uint8)
+    return np.tile(np.rint(255.0 * np.asarray(thing.color)).astype(np.uint8), (count, 1))

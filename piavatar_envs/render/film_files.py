@@ -1,0 +1,281 @@
+"""Files of films: animated glTF, a PLY file for each mesh and frame, and USD (extra ``usd``).
+
+A glTF file stores a mesh's shapes as morph targets, one a frame, and an animation of their weights ("glTF 2.0
+Specification", Khronos Group, 2021, sections 3.7.2.2 and 3.11): this is what importers read without an extension, and
+exact in every frame. Its axes are those of glTF, y up and facing z; the other formats have the suite's, z up.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from piavatar_envs.core.extras import missing
+from piavatar_envs.render.coloring import srgb_to_linear
+from piavatar_envs.render.film import Film, Moving
+
+FORMATS = ("glb", "ply", "usd")
+#: Of a file [bytes]: what the suite's own reader accepts.
+MAX_GLB = 2**31
+_ARRAYS, _INDICES = 34962, 34963  # kinds of buffer views
+_FLOAT, _UINT32, _UINT16 = 5126, 5125, 5123
+_LINEAR, _STEP = "LINEAR", "STEP"
+
+
+def write_film(film: Film, folder: Path, kind: str) -> list[Path]:
+    """Write a film into a folder, which is made.
+
+    Args:
+        film: with a frame at least.
+        folder: for ``film.glb``, ``film.usdc`` or ``MESH/0000.ply``.
+        kind: one of :data:`FORMATS`.
+
+    Returns:
+        The files, or for PLY the folders of the meshes.
+
+    Raises:
+        ImportError: usd-core is not installed, for USD.
+        ValueError: an unknown format, a film without frames, or one that is too long or has colours that change, for
+            glTF.
+        OSError: the folder cannot be written.
+    """
+    check_format(kind)
+    if film.num_frames == 0 or not film.meshes:
+        raise ValueError("this film shows nothing; add a scene first")
+    folder.mkdir(parents=True, exist_ok=True)
+    write: dict[str, Callable[[Film, Path], list[Path]]] = {"glb": _write_glb, "ply": _write_plys, "usd": _write_usd}
+    return write[kind](film, folder)
+
+
+def check_format(kind: str) -> None:
+    """Refuse a format that is unknown, or whose library is not installed.
+
+    Raises:
+        ImportError: usd-core is not installed, for USD.
+        ValueError: it is unknown.
+    """
+    if kind not in FORMATS:
+        raise ValueError(f"no format {kind!r}; use {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
+    if kind == "usd":
+        _import_usd()
+
+
+class _Glb:
+    """A document and its one buffer, which grow together."""
+
+    def __init__(self) -> None:
+        self.document: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": "piavatar-envs"},
+            "scene": 0,
+            "scenes": [{"nodes": []}],
+            "nodes": [],
+            "meshes": [],
+            "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self._content: list[bytes] = []
+        self.size = 0
+
+    def add(self, values: np.ndarray, component: int, target: int | None = None, **more: Any) -> int:
+        """Append an accessor of rows of 1, 3 or 4 numbers, and return its index."""
+        values = np.ascontiguousarray(values)
+        content = values.tobytes()
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content)}
+        if target is not None:
+            view["target"] = target
+        self.size += len(content)
+        self._content.append(content)
+        self.document["bufferViews"].append(view)
+        width = 1 if values.ndim == 1 else values.shape[1]
+        accessor = {"bufferView": len(self.document["bufferViews"]) - 1, "componentType": component}
+        accessor |= {"count": len(values), "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width], **more}
+        self.document["accessors"].append(accessor)
+        return len(self.document["accessors"]) - 1
+
+    def add_points(self, points: np.ndarray) -> int:
+        """Append positions or displacements, with the bounds that these must have."""
+        bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+        return self.add(points, _FLOAT, _ARRAYS, **bounds)
+
+    def write(self, path: Path) -> None:
+        """Write the file: the two chunks, of whole words (section 4.4)."""
+        self.document["buffers"] = [{"byteLength": self.size}]
+        document = json.dumps(self.document, separators=(",", ":")).encode()
+        document += b" " * (-len(document) % 4)
+        with path.open("wb") as stream:
+            stream.write(struct.pack("<4sII", b"glTF", 2, 28 + len(document) + self.size))
+            stream.write(struct.pack("<I4s", len(document), b"JSON") + document)
+            stream.write(struct.pack("<I4s", self.size, b"BIN\0"))
+            stream.writelines(self._content)
+
+
+def _write_glb(film: Film, folder: Path) -> list[Path]:
+    needed = sum(24 * len(shape) for mesh in film.meshes for shape in mesh.shapes if shape is not None)
+    if needed > MAX_GLB:
+        raise ValueError(f"a glTF file of {film.num_frames} frames has {needed:.1e} bytes, 2^31 at most; export fewer")
+    if any(mesh.repaints for mesh in film.meshes):
+        raise ValueError("glTF has no colours that change; use ply or usd, or color=skin")
+    glb = _Glb()
+    times = None
+    samplers: list[dict[str, Any]] = []
+    channels: list[dict[str, Any]] = []
+
+    def animate(path: str, values: np.ndarray, mode: str) -> None:
+        nonlocal times
+        if times is None:
+            seconds = np.arange(film.num_frames, dtype=np.float32) / np.float32(film.rate)
+            times = glb.add(seconds, _FLOAT, min=[0.0], max=[float(seconds[-1])])
+        samplers.append({"input": times, "output": glb.add(values, _FLOAT), "interpolation": mode})
+        target = {"node": len(glb.document["nodes"]) - 1, "path": path}
+        channels.append({"sampler": len(samplers) - 1, "target": target})
+
+    for mesh in film.meshes:
+        glb.document["scenes"][0]["nodes"].append(len(glb.document["nodes"]))
+        glb.document["nodes"].append({"name": mesh.name, "mesh": len(glb.document["meshes"])})
+        weights = _add_mesh(glb, mesh)
+        if weights.shape[1]:
+            animate("weights", weights.ravel(), _LINEAR)
+        shown = np.array([shape is not None for shape in mesh.shapes], dtype=np.float32)
+        if not shown.all():
+            animate("scale", np.repeat(shown[:, None], 3, axis=1), _STEP)
+    if samplers:
+        glb.document["animations"] = [{"name": "film", "samplers": samplers, "channels": channels}]
+    path = folder / "film.glb"
+    glb.write(path)
+    return [path]
+
+
+def _add_mesh(glb: _Glb, mesh: Moving) -> np.ndarray:
+    """Append a mesh with a target for each shape after the first, and return the targets' weights ``(frames, K)``."""
+    shapes = mesh.held()
+    # a shape that stays has one target
+    changed = np.array([False, *(not np.array_equal(a, b) for a, b in pairwise(shapes))])
+    number = np.cumsum(changed)
+    base, normals = _y_up(shapes[0]), _y_up(_normals(shapes[0], mesh.faces))
+    light = np.ones((len(base), 4))
+    light[:, :3] = srgb_to_linear(mesh.colors[mesh.first] / 255.0)
+    attributes = {
+        "POSITION": glb.add_points(base),
+        "NORMAL": glb.add(normals, _FLOAT, _ARRAYS),
+        "COLOR_0": glb.add(np.rint(65535.0 * light).astype("<u2"), _UINT16, _ARRAYS, normalized=True),
+    }
+    indices = glb.add(mesh.faces.astype("<u4").ravel(), _UINT32, _INDICES)
+    primitive: dict[str, Any] = {"attributes": attributes, "indices": indices, "material": 0}
+    targets = []
+    for frame in np.flatnonzero(changed):
+        shape = shapes[frame]
+        normal = _y_up(_normals(shape, mesh.faces)) - normals
+        targets.append({"POSITION": glb.add_points(_y_up(shape) - base), "NORMAL": glb.add(normal, _FLOAT, _ARRAYS)})
+    entry: dict[str, Any] = {"name": mesh.name, "primitives": [primitive]}
+    if targets:
+        primitive["targets"] = targets
+        entry["weights"] = [0.0] * len(targets)
+        entry["extras"] = {"targetNames": [f"frame_{frame:04d}" for frame in np.flatnonzero(changed)]}
+    glb.document["meshes"].append(entry)
+    return (number[:, None] == 1 + np.arange(len(targets))).astype(np.float32)
+
+
+def _y_up(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors in the axes of glTF."""
+    return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=1).astype(np.float32)
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return unit normals of the vertices, weighted by the areas of their triangles, shape ``(V, 3)``."""
+    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
+    areas = np.cross(b - a, c - a)
+    sums = [np.bincount(faces.ravel(), np.repeat(areas[:, axis], 3), len(vertices)) for axis in range(3)]
+    normals = np.stack(sums, axis=1)
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(size > 1e-20, normals / np.maximum(size, 1e-20), (0.0, 0.0, 1.0))
+
+
+def _write_plys(film: Film, folder: Path) -> list[Path]:
+    folders = []
+    for mesh in film.meshes:
+        folders.append(folder / mesh.name)
+        folders[-1].mkdir(exist_ok=True)
+        for frame, (shape, color) in enumerate(zip(mesh.shapes, mesh.colors, strict=True)):
+            if shape is not None:
+                write_mesh_ply(folders[-1] / f"{frame:04d}.ply", shape, mesh.faces, color)
+    return folders
+
+
+def write_mesh_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
+    """Write a mesh as a PLY file, binary and little endian.
+
+    Args:
+        path: of the file, which is replaced.
+        vertices: [m], shape ``(V, 3)``.
+        faces: triangles, shape ``(T, 3)``.
+        colors: sRGB of the vertices, shape ``(V, 3)`` uint8.
+    """
+    points = np.empty(len(vertices), dtype=[("at", "<f4", 3), ("color", "u1", 3)])
+    points["at"], points["color"] = vertices, colors
+    triangles = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    triangles["count"], triangles["corners"] = 3, faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    header += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    with path.open("wb") as stream:
+        stream.write("\n".join(header).encode())
+        stream.write(points.tobytes())
+        stream.write(triangles.tobytes())
+
+
+def _write_usd(film: Film, folder: Path) -> list[Path]:
+    """Write ``film.usdc``: a mesh prim each, with points, colours and visibility by time."""
+    pxr = _import_usd()
+    geometry, arrays = pxr.UsdGeom, pxr.Vt
+    path = folder / "film.usdc"
+    stage = pxr.Usd.Stage.CreateInMemory()
+    geometry.SetStageUpAxis(stage, geometry.Tokens.z)
+    geometry.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(film.rate)
+    stage.SetFramesPerSecond(film.rate)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(film.num_frames - 1)
+    stage.SetDefaultPrim(geometry.Xform.Define(stage, "/film").GetPrim())
+    for mesh in film.meshes:
+        prim = geometry.Mesh.Define(stage, f"/film/{mesh.name}")
+        prim.CreateSubdivisionSchemeAttr(geometry.Tokens.none)
+        prim.CreateFaceVertexCountsAttr(arrays.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+        prim.CreateFaceVertexIndicesAttr(arrays.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
+        points, extent, visibility = prim.CreatePointsAttr(), prim.CreateExtentAttr(), prim.CreateVisibilityAttr()
+        display = geometry.PrimvarsAPI(prim).CreatePrimvar(
+            "displayColor", pxr.Sdf.ValueTypeNames.Color3fArray, geometry.Tokens.vertex
+        )
+        before: tuple[Any, Any] = (None, None)
+        always = all(shape is not None for shape in mesh.shapes)
+        for frame, (shape, color) in enumerate(zip(mesh.shapes, mesh.colors, strict=True)):
+            if not always:
+                visibility.Set(geometry.Tokens.invisible if shape is None else geometry.Tokens.inherited, frame)
+            if shape is None:
+                continue
+            points.Set(arrays.Vec3fArray.FromNumpy(np.ascontiguousarray(shape, np.float32)), frame)
+            bounds = np.stack([shape.min(axis=0), shape.max(axis=0)]).astype(np.float32)
+            extent.Set(arrays.Vec3fArray.FromNumpy(bounds), frame)
+            if color is not before[1]:
+                light = srgb_to_linear(color / 255.0).astype(np.float32)
+                display.Set(arrays.Vec3fArray.FromNumpy(np.ascontiguousarray(light)), frame)
+            before = (shape, color)
+    stage.Export(str(path))
+    return [path]
+
+
+def _import_usd() -> ModuleType:
+    try:
+        import pxr
+        from pxr import Sdf, Usd, UsdGeom, Vt  # noqa: F401 - modules of their own
+    except ImportError as error:
+        raise missing("USD", "usd-core", "usd") from error
+    return pxr

@@ -1,0 +1,135 @@
+"""Files of films: read back, positions, colours and times are those of the scenes."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from piavatar_envs.avatar.gltf import read_gltf
+from piavatar_envs.render.coloring import color_by, linear_to_srgb
+from piavatar_envs.render.film import Film
+from piavatar_envs.render.film_files import write_film
+from piavatar_envs.render.scene import Body, Box, Scene, Sphere
+
+RATE, FRAMES = 25.0, 6
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
+COLORS = np.array([[250, 3, 0], [0, 200, 40], [0, 0, 255], [128, 128, 128]], dtype=np.uint8)
+
+
+def shape(frame: int) -> np.ndarray:
+    """Vertices of a tetrahedron that is bent more from frame to frame, but for one in which it rests."""
+    rest = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.1, 0.2, 1.7]], dtype=np.float32)
+    bent = rest + 0.1 * max(frame, 1) * np.sin(3.0 * rest[:, [1, 2, 0]] + 1.0)
+    return bent.astype(np.float32)
+
+
+def film(**body) -> Film:
+    """A body that moves, a box that stays, and a sphere in two of the frames."""
+    result = Film(RATE)
+    for frame in range(FRAMES):
+        markers = [Box(np.zeros(3), np.ones(3))]
+        if frame in (2, 4):
+            markers.append(Sphere(np.array([0.5 * frame, 0.0, 1.0]), 0.1))
+        if "scalars" in body:
+            body["scalars"] = np.full(4, 0.1 * frame)
+        result.add(Scene([Body(shape(frame), FACES, **(body or {"colors": COLORS}))], markers))
+    return result
+
+
+def z_up(points: np.ndarray) -> np.ndarray:
+    """Positions of a glTF file in the suite's axes."""
+    return np.stack([points[..., 0], -points[..., 2], points[..., 1]], axis=-1)
+
+
+def played(gltf, node: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of a node's mesh at every key of its weights, ``(frames, V, 3)``, and those times."""
+    primitive = gltf.json["meshes"][gltf.json["nodes"][node]["mesh"]]["primitives"][0]
+    base = gltf.accessor(primitive["attributes"]["POSITION"])
+    animation = gltf.json["animations"][0]
+    channels = [c for c in animation["channels"] if c["target"] == {"node": node, "path": "weights"}]
+    if not channels:
+        return z_up(base)[None], np.zeros(1)
+    sampler = animation["samplers"][channels[0]["sampler"]]
+    times = gltf.accessor(sampler["input"])[:, 0]
+    weights = gltf.accessor(sampler["output"]).reshape(len(times), -1)
+    targets = np.stack([gltf.accessor(target["POSITION"]) for target in primitive["targets"]])
+    return z_up(base + np.einsum("tk,kvi->tvi", weights, targets)), times
+
+
+def test_gltf_plays_the_same_positions(tmp_path):
+    (path,) = write_film(film(), tmp_path / "new", "glb")
+    gltf = read_gltf(path)
+    assert gltf.names == ["body_0", "box_0", "sphere_1"]
+    positions, times = played(gltf, 0)
+    np.testing.assert_allclose(times, np.arange(FRAMES) / RATE, rtol=1e-6)
+    np.testing.assert_allclose(positions, [shape(frame) for frame in range(FRAMES)], atol=1e-5)
+    box, _ = played(gltf, 1)
+    np.testing.assert_allclose(box[0], Box(np.zeros(3), np.ones(3)).mesh()[0], atol=1e-5)
+    sphere, _ = played(gltf, 2)
+    np.testing.assert_allclose(sphere[4], Sphere(np.array([2.0, 0.0, 1.0]), 0.1).mesh()[0], atol=1e-5)
+    (track,) = gltf.animations[0].tracks  # it is there in two frames
+    assert track.node == 2 and track.path == "scale" and track.mode == "STEP"
+    np.testing.assert_array_equal(track.values[:, 0], [0, 0, 1, 0, 1, 0])
+
+
+def test_gltf_keeps_colours_triangles_and_smooth_normals(tmp_path):
+    gltf = read_gltf(write_film(film(), tmp_path, "glb")[0])
+    primitive = gltf.json["meshes"][0]["primitives"][0]
+    colors = gltf.accessor(primitive["attributes"]["COLOR_0"])
+    np.testing.assert_allclose(linear_to_srgb(colors[:, :3]) * 255.0, COLORS, atol=0.3)
+    np.testing.assert_array_equal(gltf.accessor(primitive["indices"]).reshape(-1, 3), FACES)
+    assert len(primitive["targets"]) == FRAMES - 2  # the first two shapes are the same
+    # a sphere's normals are its radii
+    primitive = gltf.json["meshes"][2]["primitives"][0]
+    center = np.array([1.0, 1.0, 0.0])  # y up
+    radii = (gltf.accessor(primitive["attributes"]["POSITION"]) - center) / 0.1
+    normals = gltf.accessor(primitive["attributes"]["NORMAL"])
+    assert (np.einsum("vi,vi->v", normals, radii) > 0.97).all()
+
+
+def test_ply_has_a_file_for_each_mesh_and_frame(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    folders = write_film(film(scalars=None), tmp_path, "ply")
+    assert [folder.name for folder in folders] == ["body_0", "box_0", "sphere_1"]
+    assert sorted(file.name for file in folders[2].iterdir()) == ["0002.ply", "0004.ply"]
+    for frame in range(FRAMES):
+        mesh = trimesh.load(folders[0] / f"{frame:04d}.ply", process=False)
+        np.testing.assert_allclose(mesh.vertices, shape(frame), atol=1e-5)
+        np.testing.assert_array_equal(mesh.faces, FACES)
+        expected = np.rint(255.0 * color_by(np.full(4, 0.1 * frame), 0.3))
+        np.testing.assert_array_equal(mesh.visual.vertex_colors[:, :3], expected)
+
+
+def test_usd_has_points_colours_and_visibility_in_time(tmp_path):
+    usd = pytest.importorskip("pxr.Usd", reason="needs the extra usd")
+    from pxr import UsdGeom
+
+    stage = usd.Stage.Open(str(write_film(film(), tmp_path, "usd")[0]))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (RATE, FRAMES - 1)
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    body, sphere = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/film/{name}")) for name in ("body_0", "sphere_1"))
+    for frame in range(FRAMES):
+        np.testing.assert_allclose(body.GetPointsAttr().Get(frame), shape(frame), atol=1e-5)
+        seen = sphere.GetVisibilityAttr().Get(frame)
+        assert seen == ("inherited" if frame in (2, 4) else "invisible")
+    colors = linear_to_srgb(np.array(body.GetDisplayColorAttr().Get(3))) * 255.0
+    np.testing.assert_allclose(colors, COLORS, atol=0.3)
+
+
+def test_films_that_cannot_be_written_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="colours that change"):
+        write_film(film(scalars=None), tmp_path, "glb")
+    with pytest.raises(ValueError, match="no format"):
+        write_film(film(), tmp_path, "fbx")
+    with pytest.raises(ValueError, match="shows nothing"):
+        write_film(Film(RATE), tmp_path, "ply")
+    monkeypatch.setattr("piavatar_envs.render.film_files.MAX_GLB", 1000)
+    with pytest.raises(ValueError, match="export fewer"):
+        write_film(film(), tmp_path, "glb")
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(ImportError, match="usd"):
+        write_film(film(), tmp_path, "usd")
+    with pytest.raises(ValueError, match="rate"):
+        Film(0.0)
