@@ -69,7 +69,7 @@ def run(*args: str) -> str:
 
 
 def test_help_names_the_commands():
-    assert all(word in run("--help") for word in ("list", "doctor", "inspect", "play", "watch"))
+    assert all(word in run("--help") for word in ("list", "doctor", "inspect", "play", "watch", "export"))
 
 
 def test_version_is_printed(capsys):

@@ -28,6 +28,7 @@ SMALLER = {
     "num_agents=3": "num_agents=2, fidelity='tiny', episode_seconds=0.5",
     ".learn(300)": ".learn(1)",
     'device="cuda"': "device=DEVICE",
+    'Path("reach")': 'FOLDER / "reach"',
 }
 
 
@@ -81,7 +82,7 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
     code = blocks(PAGES[name])
     for file, block in zip(saved, code, strict=False):
         (tmp_path / file).write_text(block, encoding="utf-8")
-    space = {"DEVICE": device, "__name__": name}
+    space = {"DEVICE": device, "FOLDER": tmp_path, "__name__": name}
     for block in code[len(saved) :]:
         if block.startswith(">>>"):
             check_refusals(block, space)

@@ -91,7 +91,7 @@ class Film:
 
     @property
     def meshes(self) -> list[Moving]:
-        """What there is to see, in all frames."""
+        """The meshes so far, each with a shape or None for every frame."""
         for mesh in self._meshes.values():
             missing = self.num_frames - len(mesh.shapes)
             mesh.shapes += missing * [None]
