@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from piavatar_envs.render.coloring import color_by
-from piavatar_envs.render.geometry import drawable
 from piavatar_envs.render.scene import Body, Marker, Scene
 
 
@@ -52,7 +51,9 @@ class Moving:
         last = next((kept for kept in reversed(self.colors) if kept is not None), None)
         if last is not None and np.array_equal(last, color):
             color = last
-        self.shapes += [*(missing * [None]), drawable(shape)]
+        # of a failed simulation, too, which programs would not read otherwise
+        shape = np.nan_to_num(np.asarray(shape, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+        self.shapes += [*(missing * [None]), shape]
         self.colors += [*(missing * [None]), color]
 
 
