@@ -291,8 +291,9 @@ class TorqueControlConfig(BaseModel):
 ControlConfig = Annotated[PoseControlConfig | TorqueControlConfig, Field(discriminator="mode")]
 
 
-#: Value of a setting of an avatar source.
-SourceValue = bool | int | float | str | tuple[bool | int | float | str, ...] | None
+#: Value of a setting of an avatar source; a mapping has the settings of another source.
+PlainValue = bool | int | float | str | tuple[bool | int | float | str, ...] | None
+SourceValue = PlainValue | dict[str, PlainValue]
 
 
 class AvatarSourceConfig(BaseModel):

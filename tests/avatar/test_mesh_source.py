@@ -72,15 +72,15 @@ def test_the_body_of_a_mesh_has_particles_and_its_colours(file, person):
 
 def test_a_height_wins_over_the_unit_of_the_file():
     column = np.array([[0.0, 0.0, 0.0], [0.1, 0.1, 17.0]])
-    scaled, notes = mesh._in_metres("x", column, 1.7)
+    scaled, notes = mesh.in_metres("x", column, 1.7)
     assert scaled[1, 2] == pytest.approx(1.7) and "1.7 m" in notes[0]
     for tall, unit in ((1.7, "metres"), (170.0, "centimetres"), (1700.0, "millimetres")):
-        scaled, notes = mesh._in_metres("x", column * (tall / 17.0), None)
+        scaled, notes = mesh.in_metres("x", column * (tall / 17.0), None)
         assert scaled[1, 2] == pytest.approx(1.7) and unit in notes[0]
     with pytest.raises(ValueError, match=r"17 units tall.*height"):
-        mesh._in_metres("x", column, None)
+        mesh.in_metres("x", column, None)
     with pytest.raises(ValueError, match=r"height=9 .*0.3, 3"):
-        mesh._in_metres("x", column, 9.0)
+        mesh.in_metres("x", column, 9.0)
 
 
 def test_a_surface_that_the_body_does_not_fit_to_is_refused(file, monkeypatch):

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, local_rotations
+from piavatar_envs.avatar.body.splats import SkinnedSplats
 
 NUM_SKIN_JOINTS = 4
 SAMPLE_DEVIATION = 0.4  # standard deviation of a sampled shape parameter, before the clip to [-1, 1]
@@ -65,6 +66,7 @@ class Look:
             a scene have in turn; None for the one colour of the avatar.
         shape_deltas: displacements as those of the skin [m], shape ``(S, 2, W, 3)`` float32.
         pose: displacements that depend on the pose, if the file has such.
+        splats: what is drawn in place of the triangles; they have the mean shape only.
     """
 
     vertices: np.ndarray
@@ -74,6 +76,7 @@ class Look:
     colors: np.ndarray | None
     shape_deltas: np.ndarray
     pose: PoseDisplacements | None = None
+    splats: SkinnedSplats | None = None
 
     def colors_of(self, avatar: int) -> np.ndarray | None:
         """Return the colours of the avatar of an index in its scene, ``(W, 3)``; on each call the same array."""
@@ -98,6 +101,21 @@ class SkeletonPoints:
 
 
 @dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points at the skin, each of which is a particle.
+
+    Attributes:
+        points: in the reference pose of the mean shape [m], shape ``(K, 3)``.
+        skin_joints: joints that move each, shape ``(K, 4)`` int32.
+        skin_weights: their weights, descending, rows sum to one, shape ``(K, 4)`` float32.
+    """
+
+    points: np.ndarray
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class AvatarAsset:
     """A skinned, shapeable body. Axes: metres, z up, facing -y, its left is +x; joints as in ``skeleton.py``.
 
@@ -118,6 +136,7 @@ class AvatarAsset:
         outfit: makes the look from the asset when that is first drawn, where ``look`` is None.
         skeleton: where bone particles are put; None puts them around the bones' axes.
         groups: weights in [0, 1] of the vertices in groups that the file names, each shape ``(V,)`` float32.
+        surface_points: particles at the skin besides those that fill the body; None for none.
     """
 
     name: str
@@ -133,6 +152,7 @@ class AvatarAsset:
     outfit: Callable[[AvatarAsset], Look] | None = None
     skeleton: SkeletonPoints | None = None
     groups: Mapping[str, np.ndarray] = field(default_factory=dict)
+    surface_points: SurfacePoints | None = None
 
     def shape(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
         """Return the body of shape parameters ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.
@@ -162,6 +182,18 @@ class AvatarAsset:
         drawn = self.drawn
         vertices = drawn.vertices + np.tensordot(self._halves(parameters), drawn.shape_deltas, axes=2)
         return ShapedBody((vertices - origin).astype(np.float32), (joints - origin).astype(np.float32))
+
+    def shape_splats(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
+        """Return the centres of the look's splats and the joints, where :meth:`shape` has put the body.
+
+        Raises:
+            ValueError: as :meth:`shape`, or the look has no splats.
+        """
+        splats = self.drawn.splats
+        if splats is None:
+            raise ValueError(f"{self.name} has no splats; use an avatar of the source gaussian")
+        _, joints, origin = self._shaped(parameters)
+        return ShapedBody((splats.cloud.means - origin).astype(np.float32), (joints - origin).astype(np.float32))
 
     def mean_body(self) -> ShapedBody:
         """Return the shape of all parameters zero."""

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -113,9 +113,10 @@ def pose_correctives(asset: AvatarAsset, particles: ParticleSet) -> PoseCorrecti
 def _fitted(asset: AvatarAsset, particles: ParticleSet) -> PoseCorrectives:
     """Fit the correctives, or interpolate those of other particles."""
     spacing = spacing_for(float(np.ptp(asset.vertices[:, 2])) / CELLS_PER_HEIGHT)
-    if np.isclose(particles.spacing, spacing, rtol=0.01):
+    if np.isclose(particles.spacing, spacing, rtol=0.01) and asset.surface_points is None:
         return _listed(fit_correctives(particles, asset.joints.astype(float)))
-    coarse = sample_particles(asset, spacing)
+    plain = asset if asset.surface_points is None else replace(asset, surface_points=None)
+    coarse = sample_particles(plain, spacing)
     fitted = fit_correctives(coarse, asset.joints.astype(float))
     others, own = (dense_weights(one.skin_joints, one.skin_weights) for one in (particles, coarse))
     places = (one.rest_positions.astype(float) for one in (particles, coarse))

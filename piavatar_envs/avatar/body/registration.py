@@ -9,6 +9,7 @@ Gauss-Newton step solves for all unknowns. Robust weights, whose width shrinks, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,6 +33,8 @@ _COARSE_STEPS, _FINE_STEPS = 12, 30
 _FINALISTS = 2
 #: Pull of shape parameters and rotations to their rest, over the weight of a point at the final width.
 _SHAPE_PULL, _POSE_PULL = 0.02, 0.01
+#: Poses that a search starts from: the rest pose, and the same with level arms.
+POSES = ("A", "T")
 #: Cosine between normals of points that may be a pair.
 _AGREE = 0.3
 
@@ -66,7 +69,7 @@ class Fit:
         return Fit(float(np.exp(vector[0])), vector[1:4], vector[4:7], shape, vector[7 + num_shapes :])
 
     def local_rotations(self) -> np.ndarray:
-        """Return local rotations of the joints, shape ``(22, 3, 3)``."""
+        """Return local rotations of the joints from the pose of the model, shape ``(22, 3, 3)``."""
         vectors = np.zeros((NUM_JOINTS, 3))
         for index, name in enumerate(_MIRRORED):
             own = self.pose[3 * index : 3 * index + 3]
@@ -97,10 +100,18 @@ class Registered:
 
 
 class Model:
-    """Some vertices of the embedded body, which move with all unknowns."""
+    """Some vertices of a body, which move with all unknowns."""
 
-    def __init__(self, asset: AvatarAsset, rows: np.ndarray) -> None:
+    def __init__(self, asset: AvatarAsset, rows: np.ndarray, pose: np.ndarray | None = None) -> None:
+        """Prepare the vertices.
+
+        Args:
+            asset: the body.
+            rows: indices of the vertices.
+            pose: local rotations that those of a fit are added to, shape ``(22, 3, 3)``; by default its own pose.
+        """
         self.asset, self.rows = asset, rows
+        self._pose = np.tile(np.eye(3), (NUM_JOINTS, 1, 1)) if pose is None else pose
         self._vertices = asset.vertices[rows].astype(np.float64)
         self._deltas = asset.shape_deltas[:, :, rows].astype(np.float64)
         self._weights = dense_weights(asset.skin_joints[rows], asset.skin_weights[rows])
@@ -114,16 +125,32 @@ class Model:
 
     def points(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return vertices ``(N, 3)`` [m], normals ``(N, 3)`` and joints ``(22, 3)`` [m] of a fit."""
-        halves = np.stack([np.maximum(-fit.shape, 0.0), np.maximum(fit.shape, 0.0)], axis=1)
-        rest = self._vertices + np.tensordot(halves, self._deltas, axes=2)
-        joints = self.asset.joints + np.tensordot(halves, self.asset.shape_joints.astype(np.float64), axes=2)
-        rotations, positions = forward_kinematics(fit.local_rotations(), joints[0], joints)
+        rest, joints = self.shaped(fit)
+        rotations, positions = self.placed(fit, joints)
         blended = blended_maps(self._weights, bone_maps(rotations, positions, joints))
         posed = np.einsum("nij,nj->ni", blended[..., :3], rest) + blended[..., 3]
         turn = Rotation.from_rotvec(fit.turn)
         normals = turn.apply(np.einsum("nij,nj->ni", blended[..., :3], self._normals))
         place = fit.scale * turn.as_matrix().T
         return posed @ place + fit.shift, _unit(normals), positions @ place + fit.shift
+
+    def shaped(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Return vertices ``(N, 3)`` and joints ``(22, 3)`` [m] of the body in the shape of a fit, as it rests."""
+        halves = np.stack([np.maximum(-fit.shape, 0.0), np.maximum(fit.shape, 0.0)], axis=1)
+        rest = self._vertices + np.tensordot(halves, self._deltas, axes=2)
+        return rest, self.asset.joints + np.tensordot(halves, self.asset.shape_joints.astype(np.float64), axes=2)
+
+    def placed(self, fit: Fit, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return rotations ``(22, 3, 3)`` and joints ``(22, 3)`` [m] in the pose of a fit, from those at rest."""
+        return forward_kinematics(self._pose @ fit.local_rotations(), joints[0], joints)
+
+    def maps(self, fit: Fit) -> np.ndarray:
+        """Return the affine maps ``(22, 3, 4)`` by which the bones take the body at rest to its place in a fit."""
+        joints = self.shaped(fit)[1]
+        maps = bone_maps(*self.placed(fit, joints), joints)
+        maps = fit.scale * Rotation.from_rotvec(fit.turn).as_matrix() @ maps
+        maps[..., 3] += fit.shift
+        return maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,18 +190,40 @@ def register(asset: AvatarAsset, vertices: np.ndarray, faces: np.ndarray, body: 
         body: triangles that are not worn, shape ``(T,)`` bool.
     """
     rng = np.random.default_rng(0)
-    coarse_cloud, cloud = (_sample(vertices, faces[body], count, rng) for count in (4 * _COARSE, 4 * _FINE))
-    coarse, fine = (Model(asset, _spread(asset, count)) for count in (_COARSE, _FINE))
-    starts = [_refine(coarse, coarse_cloud, start, _COARSE_STEPS, _COARSE) for start in _starts(coarse, vertices)]
-    starts = sorted(starts, key=lambda fit: _residual(coarse, coarse_cloud, fit))[:_FINALISTS]
-    fits = [_refine(fine, cloud, start, _FINE_STEPS, _FINE) for start in starts]
-    fit = min(fits, key=lambda one: _residual(fine, cloud, one))
+    coarse_cloud, cloud = (_sample(vertices, faces[body], 4 * count, rng) for count in (_COARSE, _FINE))
+    fit = fit_body(asset, coarse_cloud, cloud, (vertices.min(axis=0), vertices.max(axis=0)))
     whole = Model(asset, np.arange(len(asset.vertices)))
     points, normals, joints = whole.points(fit)
     apart = _distance(points[:: len(points) // _FINE], vertices, faces[body])
     apart = 0.5 * (apart + _distance(cloud.points[::4], points, asset.faces))
     weights = _weights_at(asset, Cloud(points, normals), vertices, faces)
     return Registered(fit.turn, fit.shape, joints, weights, apart / float(np.ptp(vertices[:, 2])))
+
+
+def fit_body(
+    asset: AvatarAsset,
+    coarse_cloud: Cloud,
+    cloud: Cloud,
+    box: tuple[np.ndarray, np.ndarray],
+    poses: Sequence[str] = POSES,
+    pose: np.ndarray | None = None,
+) -> Fit:
+    """Fit a body to points, which may face any horizontal axis.
+
+    Args:
+        asset: the body.
+        coarse_cloud: points for the search of a start.
+        cloud: points for the fit.
+        box: lowest and highest corner of all of them [m].
+        poses: of :data:`POSES`, that the search starts from.
+        pose: local rotations that these are added to, shape ``(22, 3, 3)``.
+    """
+    coarse, fine = (Model(asset, _spread(asset, count), pose) for count in (_COARSE, _FINE))
+    starts = _starts(coarse, box, poses)
+    starts = [_refine(coarse, coarse_cloud, start, _COARSE_STEPS, _COARSE) for start in starts]
+    starts = sorted(starts, key=lambda fit: _residual(coarse, coarse_cloud, fit))[:_FINALISTS]
+    fits = [_refine(fine, cloud, start, _FINE_STEPS, _FINE) for start in starts]
+    return min(fits, key=lambda one: _residual(fine, cloud, one))
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -207,9 +256,9 @@ def _spread(asset: AvatarAsset, count: int) -> np.ndarray:
     return np.linspace(0, len(asset.vertices) - 1, min(count, len(asset.vertices))).astype(int)
 
 
-def _starts(model: Model, vertices: np.ndarray) -> list[Fit]:
+def _starts(model: Model, box: tuple[np.ndarray, np.ndarray], poses: Sequence[str]) -> list[Fit]:
     """Return the body upright on the ground, facing the four horizontal axes, in its rest pose and a T-pose."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = box
     scale = float(high[2] - low[2]) / model.height
     none = np.zeros(len(model.asset.shape_names))
     rest, straight = np.zeros((2, 3 * len(_MIRRORED) + len(_SAGITTAL)))
@@ -218,7 +267,7 @@ def _starts(model: Model, vertices: np.ndarray) -> list[Fit]:
     fits = []
     for quarter in range(4):
         turn = np.array([0.0, 0.0, 0.5 * np.pi * quarter])
-        for pose in (rest, straight):
+        for pose in (straight if name == "T" else rest for name in poses):
             start = Fit(scale, turn, np.zeros(3), none, pose)
             points = model.points(start)[0]
             shift = 0.5 * (low + high) - 0.5 * (points.min(axis=0) + points.max(axis=0))

@@ -3,7 +3,8 @@
 *Flesh* particles sit in the cells of a regular lattice, each at the centroid of the part of its cell that is inside the
 skin, so thin limbs are filled as well as thick ones. *Bone* particles are ordinary particles too, a small lattice along
 every bone, rigidly skinned to it: the Kabsch fit that tracks the pose reads only them. Where the asset has a skeleton,
-they are its points, one a cube of the lattice, and the small lattice fills up bones that have too few.
+they are its points, one a cube of the lattice, and the small lattice fills up bones that have too few. *Surface*
+particles are points that an asset brings, such as Gaussian splats; flesh of the lattice makes room for them.
 
 Values are interpolated inside the body by harmonic functions on the graph of its particles. In memory neighbours should
 be neighbours in the body: then the threads of a warp access the same nodes of the grid, or blend the same bones.
@@ -26,6 +27,7 @@ from piavatar_envs.avatar.body.asset import (
     AvatarAsset,
     ShapedBody,
     SkeletonPoints,
+    SurfacePoints,
     dense_weights,
     mesh_volume,
     top_weights,
@@ -309,6 +311,7 @@ SPACING_PER_DX = 0.57  # lattice spacing over grid spacing: about 5 particles a 
 SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
 LINK_LENGTH = 1.8  # of a link between neighbouring particles, over the spacing
+SURFACE_LINKS = 8  # of a point that the asset brings, to flesh of the lattice
 SHELL = 0.75  # depth of the particles that simply follow the skin, over the spacing
 INSET = 0.05  # depth of a particle that a change of shape would leave outside, over the spacing
 MIN_WEIGHT = 0.01  # smaller skinning weights are dropped
@@ -383,7 +386,7 @@ def sample_particles(
     if bone_rings < 4:
         raise ValueError(f"bone_rings={bone_rings} gives under {MIN_BONE_PARTICLES} particles a bone; use 4 or more")
     surface = (asset.vertices, asset.faces, asset.joints, asset.skin_joints, asset.skin_weights)
-    values = [*surface, asset.skeleton, spacing, seed, bone_rings, bone_voxel]
+    values = [*surface, asset.skeleton, asset.surface_points, spacing, seed, bone_rings, bone_voxel]
     digest = digest_of(values, [sys.modules[__name__], skeleton_mesh])
     doing = f"filling {asset.name} with particles {1e3 * spacing:.2g} mm apart"
     arrays = kept("particles", digest, lambda: _sample(asset, spacing, seed, bone_rings, bone_voxel), doing)
@@ -397,20 +400,24 @@ def _sample(asset: AvatarAsset, spacing: float, seed: int, bone_rings: int, bone
     skin = ClosedSurface(asset.vertices, asset.faces)
     flesh, interior = _flesh_lattice(asset, skin, spacing, seed)
     bones, bone_of = _bone_particles(asset, skin, bone_rings, spacing, bone_voxel)
-    flesh = flesh[cKDTree(bones).query(flesh)[0] > BONE_CLEARANCE * spacing]
-    positions = np.concatenate([bones, flesh]).astype(np.float32)
-    bone = np.concatenate([bone_of, np.full(len(flesh), -1)]).astype(np.int32)
+    added = _no_points() if asset.surface_points is None else asset.surface_points
+    flesh = flesh[cKDTree(np.concatenate([bones, added.points])).query(flesh)[0] > BONE_CLEARANCE * spacing]
+    positions = np.concatenate([bones, flesh, added.points]).astype(np.float32)
+    bone = np.concatenate([bone_of, np.full(len(flesh) + len(added.points), -1)]).astype(np.int32)
+    # the index of a particle among the points that the asset brings, or -1
+    brought = np.concatenate([np.full(len(bones) + len(flesh), -1), np.arange(len(added.points))])
     order = order_along_curve(positions, spacing)
-    positions, bone = positions[order], bone[order]
+    positions, bone, brought = positions[order], bone[order], brought[order]
     distance, face, coordinates = skin.query(positions)
     anchors = asset.faces[face]
     surface = np.einsum("pc,pcj->pj", coordinates, dense_weights(asset.skin_joints, asset.skin_weights)[anchors])
-    links = _links(positions, -distance, surface, skin, spacing)
+    surface[brought >= 0] = dense_weights(added.skin_joints, added.skin_weights)[brought[brought >= 0]]
+    links = _links(positions, -distance, surface, skin, spacing, brought >= 0)
     surface[bone >= 0] = np.eye(NUM_JOINTS)[bone[bone >= 0]]
-    shell = distance > -SHELL * spacing
+    shell = (distance > -SHELL * spacing) | (brought >= 0)
     weights = fill(links, positions, surface, shell | (bone >= 0))
     skin_joints, skin_weights = top_weights(_local(weights))
-    volumes = _volumes(positions, bone, interior, mesh_volume(asset.vertices, asset.faces))
+    volumes = _volumes(positions, bone, brought >= 0, interior, mesh_volume(asset.vertices, asset.faces))
     depth = np.maximum(-distance, 0.0)
     order = order_of_body(positions, bone, skin_joints, skin_weights)
     links = np.argsort(order).astype(np.int32)[links]
@@ -426,6 +433,10 @@ def _sample(asset: AvatarAsset, spacing: float, seed: int, bone_rings: int, bone
         "depth": depth,
     }
     return {"links": links, **{name: array[order] for name, array in of_particles.items()}}
+
+
+def _no_points() -> SurfacePoints:
+    return SurfacePoints(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.int32), np.zeros((0, 4), np.float32))
 
 
 def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple[np.ndarray, np.ndarray]:
@@ -448,7 +459,8 @@ def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple
     rest = particles.rest_positions.astype(np.float64)
     moved = rest + fill(particles.links, rest, guess, particles.shell)
     skin = ClosedSurface(body.vertices, asset.faces)
-    moved = _pushed_inside(moved, skin, asset.faces, body, INSET * particles.spacing)
+    inside = particles.depth > 0.0  # points that an asset brings may be outside of its skin
+    moved[inside] = _pushed_inside(moved[inside], skin, asset.faces, body, INSET * particles.spacing)
     volumes = particles.volumes * volume_ratios(particles.links, rest, moved)
     volumes *= mesh_volume(body.vertices, asset.faces) / volumes.sum()
     return moved.astype(np.float32), volumes.astype(np.float32)
@@ -563,19 +575,30 @@ def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[
 
 
 def _links(
-    positions: np.ndarray, depth: np.ndarray, surface: np.ndarray, skin: ClosedSurface, spacing: float
+    positions: np.ndarray,
+    depth: np.ndarray,
+    surface: np.ndarray,
+    skin: ClosedSurface,
+    spacing: float,
+    brought: np.ndarray,
 ) -> np.ndarray:
     """Return neighbouring particles ``(L, 2)`` int32, not across an air gap or between limbs that touch.
 
     Two limbs that touch have an air gap between their particles (the link's middle is outside) or skin weights
-    without a joint in common.
+    without a joint in common. Points that the asset has ``brought`` are linked to flesh of the lattice only.
     """
-    links = cKDTree(positions).query_pairs(LINK_LENGTH * spacing, output_type="ndarray")
+    lattice, others = np.flatnonzero(~brought), np.flatnonzero(brought)
+    tree = cKDTree(positions[lattice])
+    links = lattice[tree.query_pairs(LINK_LENGTH * spacing, output_type="ndarray")]
+    if len(others):
+        near = lattice[tree.query(positions[others], k=SURFACE_LINKS)[1]]
+        links = np.concatenate([links, np.sort(np.stack([np.repeat(others, SURFACE_LINKS), near.ravel()], axis=1))])
     links = links[np.lexsort((links[:, 1], links[:, 0]))]
     joints = (surface > 0.0) @ (1 << np.arange(NUM_JOINTS))  # a bit for each
     links = links[(joints[links[:, 0]] & joints[links[:, 1]]) != 0]
     reach = 0.5 * np.linalg.norm(positions[links[:, 0]] - positions[links[:, 1]], axis=1)
-    inside = depth[links].max(axis=1) > reach  # the ball about the deeper end holds the middle
+    # the ball about the deeper end holds the middle
+    inside = (depth[links].max(axis=1) > reach) | brought[links].any(axis=1)
     inside[~inside] = skin.distance(positions[links[~inside]].mean(axis=1)) < 0.0
     return links[inside].astype(np.int32)
 
@@ -591,16 +614,19 @@ def _local(weights: np.ndarray) -> np.ndarray:
     return kept / kept.sum(axis=1, keepdims=True)
 
 
-def _volumes(positions: np.ndarray, bone: np.ndarray, interior: np.ndarray, total: float) -> np.ndarray:
+def _volumes(
+    positions: np.ndarray, bone: np.ndarray, brought: np.ndarray, interior: np.ndarray, total: float
+) -> np.ndarray:
     """Return volumes [m^3] ``(P,)`` float32; each interior point counts for the nearest particle.
 
-    The particles of one bone share theirs evenly: some are closer together than the interior points.
+    The particles of one bone share theirs evenly: some are closer together than the interior points. So may those be
+    that the asset has ``brought``; at least a twentieth of all is theirs.
     """
     nearest = cKDTree(positions).query(interior, workers=-1)[1]
     share = np.bincount(nearest, minlength=len(positions)).astype(np.float64)
     for joint in range(NUM_JOINTS):
         share[bone == joint] = share[bone == joint].mean()
-    share = np.maximum(share, 0.25)
+    share = np.maximum(share, np.where(brought, 0.05 * len(interior) / max(brought.sum(), 1), 0.25))
     return (share * (total / share.sum())).astype(np.float32)
 
 

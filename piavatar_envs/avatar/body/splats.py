@@ -141,6 +141,21 @@ class SplatCloud:
         return np.clip(0.5 + np.einsum("sk,skc->sc", basis, self.sh), 0.0, 1.0)
 
 
+@dataclass(frozen=True, eq=False)
+class SkinnedSplats:
+    """Splats that bones move.
+
+    Attributes:
+        cloud: the splats in the rest pose.
+        skin_joints: joints that move each splat, shape ``(S, 4)`` int32.
+        skin_weights: their weights, descending, rows sum to one, shape ``(S, 4)`` float32.
+    """
+
+    cloud: SplatCloud
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+
+
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return the real spherical harmonics up to a degree of unit directions, shapes ``(..., 3)`` to ``(..., K)``."""
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)

@@ -138,8 +138,17 @@ def _builder(source: str) -> Builder:
     return _registered.get(source) or importlib.import_module(f"{__name__}.{source}").build
 
 
+class _Settings(dict):
+    """Settings within a setting, which can be hashed; never changed."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(sorted(self.items(), key=lambda item: item[0])))
+
+
 def _plain(value: Any) -> Any:
     """Return a setting as a value that can be compared and hashed."""
+    if isinstance(value, Mapping):
+        return _Settings({str(name): _plain(item) for name, item in value.items()})
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if isinstance(value, np.generic):
@@ -151,6 +160,8 @@ def _plain(value: Any) -> Any:
 
 def _version(value: Any) -> tuple[tuple[str, int, int], ...] | None:
     """Return time of change and size of the files that a setting names, so that changed ones are read anew."""
+    if isinstance(value, Mapping):
+        return tuple(file for item in value.values() for file in _version(item) or ())
     if not isinstance(value, str) or not os.path.exists(value):
         return None
     files = [(str(file), os.stat(file)) for file in files_behind(Path(value))]

@@ -30,7 +30,7 @@ MOST_RESIDUAL = 0.015
 #: Units that a height is tried in [m].
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 #: Our axes from those of a file in which y points up.
-_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 #: Colour of surfaces without one.
 _CLAY = (219, 194, 176)
 
@@ -61,9 +61,9 @@ def read_character(path: str, height: float | None = None, up: str | None = None
         raise ValueError(f"up={up!r} is no axis that points up; use y or z")
     found = []
     for axis in [up] if up else _possible_ups(vertices, Path(path).suffix.lower()):
-        matrix = _Y_UP if axis == "y" else np.eye(3)
+        matrix = Y_UP if axis == "y" else np.eye(3)
         upright = vertices @ matrix.T
-        scaled, note = _in_metres(name, upright, height)
+        scaled, note = in_metres(name, upright, height)
         matrix = matrix * (np.ptp(scaled[:, 2]) / np.ptp(upright[:, 2]))
         found.append((_registered(name, scaled, faces), scaled, matrix, (f"{axis} points up", *note)))
     registered, scaled, matrix, notes = min(found, key=lambda one: one[0].residual)
@@ -147,7 +147,7 @@ def _possible_ups(vertices: np.ndarray, suffix: str) -> list[str]:
     return {0: ["z", "y"], 1: ["z"], 2: ["y"]}[int(np.ptp(vertices, axis=0).argmin())]
 
 
-def _in_metres(name: str, vertices: np.ndarray, height: float | None) -> tuple[np.ndarray, tuple[str, ...]]:
+def in_metres(name: str, vertices: np.ndarray, height: float | None) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the vertices at a height, or in the first unit in which theirs is a person's."""
     tall = float(np.ptp(vertices[:, 2]))
     low, high = HEIGHTS
