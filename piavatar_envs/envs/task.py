@@ -18,6 +18,7 @@ from piavatar_envs.avatar.body.skeleton import joint_limits
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.config.schema import select_joints
 from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.envs.framing import Sphere, around_avatar, around_prop, frame
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.sim.randomize import Parameter
@@ -114,8 +115,11 @@ class Task:
         observes_others: whether agents observe each other.
         targets_about_reference: whether, under ``control="pd"``, targets are counted from the reference pose; else from
             the rest pose.
+        camera_direction: from the scene to the camera of pictures, which is as near as it can be to hold :meth:`shown`.
+        camera_follows: whether the camera goes with the agents' middle.
         camera_position, camera_target: the eye and the point that it looks at [m], from the ground below the agents'
-            middle, or from the origin if the camera does not follow them (``camera_follows``).
+            middle, or from the origin if the camera does not follow; None until they are computed, unless a task or
+            the settings give both.
         reward_names, cost_names, metric_names: names of the terms and metrics; derived.
 
     Class attributes for the task's page in ``docs/envs`` (Markdown; ``python -m scripts.env_pages`` writes it):
@@ -150,8 +154,9 @@ class Task:
     observes_others: ClassVar[bool] = False
     targets_about_reference: ClassVar[bool] = False
 
-    camera_position: tuple[float, float, float] = (1.75, -3.75, 1.62)
-    camera_target: tuple[float, float, float] = (0.0, -0.04, 0.86)
+    camera_direction: ClassVar[tuple[float, float, float]] = (1.75, -3.7, 0.76)
+    camera_position: tuple[float, float, float] | None = None
+    camera_target: tuple[float, float, float] | None = None
     camera_follows: bool = True
     motion_names: tuple[str, ...] = ()
 
@@ -223,7 +228,7 @@ class Task:
         self._place_camera()
 
     def _place_camera(self) -> None:
-        """Let the settings of pictures, where they are given, replace the task's camera.
+        """Place the camera by the settings of pictures, where they are given, else such that it shows everything.
 
         Raises:
             ConfigError: the camera would look at its own place.
@@ -232,6 +237,15 @@ class Task:
             chosen = getattr(self.config.render, name)
             if chosen is not None:
                 setattr(self, name, chosen)
+        if self.camera_position is None or self.camera_target is None:
+            middle = (
+                np.mean([avatar.position for avatar in self.scene.avatars], axis=0) if self.camera_follows else (0, 0)
+            )
+            spheres = [(x - middle[0], y - middle[1], z, radius) for x, y, z, radius in self.shown()]
+            render = self.config.render
+            position, target = frame(spheres, self.camera_direction, render.width / render.height)
+            self.camera_position = self.camera_position or position
+            self.camera_target = self.camera_target or target
         if np.allclose(self.camera_position, self.camera_target):
             place = list(self.camera_position)
             raise ConfigError(f"render.camera_position={place} is where it looks; move it or render.camera_target")
@@ -281,6 +295,15 @@ class Task:
         domain; the places that the scene gives are checked anyway.
         """
         return {}
+
+    def shown(self) -> list[Sphere]:
+        """Return what pictures show from the first: places of an adult's avatars, props and marks, and their radii.
+
+        A task with marks adds those to avatars and props; x, y, z and radius each [m].
+        """
+        places = self.prop_places()
+        avatars = [sphere for avatar in self.scene.avatars for sphere in around_avatar(avatar)]
+        return avatars + [s for prop in self.scene.props for s in around_prop(prop, places.get(prop.name, ()))]
 
     def drawn(self) -> tuple[Parameter, ...]:
         """Return the numbers that the task draws for each episode, for ``observe_parameters``.

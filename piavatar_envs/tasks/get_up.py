@@ -271,8 +271,7 @@ class GetUpTask(Task):
         TaskArray("reference_root", wp.vec3),
     )
 
-    camera_position = (2.4, -3.6, 1.6)
-    camera_target = (0.0, 0.0, 0.78)
+    camera_direction = (2.4, -3.6, 0.82)
 
     summary = """The avatar lies on the ground, face down or face up (`face_up`), turned about the vertical at random,
 its arms beside it, its joints up to `pose_noise` off that pose. A share of episodes, `halfway`, begins on the way up

@@ -135,8 +135,7 @@ class HeaderTask(GateTask):
     )
     scratch_arrays = (*GateTask.scratch_arrays, TaskArray("head", wp.vec3))
 
-    camera_position = (-4.7, 0.1, 2.0)
-    camera_target = (0.0, -0.85, 1.05)
+    camera_direction = (-3.6, 2.2, 0.8)
 
     summary = """A soft ball, its mass drawn from `ball_mass`, falls from a height in the range `ball_height`, with a
 speed of up to `ball_speed` to the side, and comes down within about `ball_jitter` of `ball_place`: on the forehead of

@@ -88,8 +88,7 @@ class KickBallTask(GateTask):
     description = "kick a soft ball through a gate on the ground"
     observation_terms = (*GATE_TERMS, *FEET_TERMS)
 
-    camera_position = (-3.6, 0.9, 1.5)
-    camera_target = (0.1, -0.85, 0.65)
+    camera_direction = (-3.0, 2.4, 1.0)
 
     summary = """A soft ball lies on the ground in front of the right foot, within `ball_jitter` of `ball_place`. Its
 mass is drawn from `ball_mass`, uniformly in its logarithm, and observed. A gate stands at a `target_distance` from the

@@ -17,6 +17,7 @@ from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of, write_in_root
+from piavatar_envs.envs.framing import Sphere
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -248,8 +249,7 @@ class PushBoxTask(Task):
     state_arrays = (TaskArray("target", wp.vec3), TaskArray("way"))
     scratch_arrays = (TaskArray("hands", wp.vec3, (2,)),)
 
-    camera_position = (3.0, -2.5, 1.75)
-    camera_target = (0.0, -0.55, 0.65)
+    camera_direction = (3.0, -1.95, 1.1)
 
     summary = """A soft box stands in front of the avatar, turned at random by up to `box_turn`; its mass is drawn from
 `box_mass` and observed. Its target is a place on the floor at a `target_distance` from the box, within `target_angle`
@@ -314,6 +314,15 @@ each action the command is clamped to within 0.1 m and 0.3 rad of the body."""
     def action_spec(self) -> ActionSpec:
         joint_speed = self.config.control.joint_speed_limit
         return ActionSpec(self.joints, root=True, joint_speed=joint_speed, root_speed=WALK, root_turn_speed=TURN)
+
+    def shown(self) -> list[Sphere]:
+        """Return avatar, box, and the mark of the target at its places."""
+        config, (x, y) = self.config, self.place[:2]
+        marks = []
+        for angle in (-config.target_angle, 0.0, config.target_angle):
+            far, box = np.array(self._ahead(config.target_distance[1], angle)), self._ahead(config.box_distance[1])
+            marks.append((*(far + box - [x, y]).tolist(), 0.0, config.target_radius))
+        return super().shown() + marks
 
     def domain(self) -> Domain:
         """Include every place from which the body may have to push."""

@@ -26,6 +26,7 @@ from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks.games import game_modules
 from tests.api.runs import bytes_of
 from tests.conftest import reward_terms
+from tests.tasks.measured import assert_all_is_seen
 
 GAME = "sumo_v0"
 
@@ -404,3 +405,7 @@ def test_no_picture_without_a_render_mode(make_game):
     make_game(GAME).reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
         assert make_game(GAME).render() is None
+
+
+def test_a_new_episode_is_all_in_the_picture(make_game, game_name):
+    assert_all_is_seen(make_game(game_name))

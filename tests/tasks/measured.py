@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.api.pictures import SceneReader, camera_of
 from piavatar_envs.avatar.body.skeleton import joint_index
 
 
@@ -60,3 +63,27 @@ def prop_motion(batch, name: str = "ball") -> tuple[np.ndarray, np.ndarray, np.n
     x, v = state.x.numpy()[:, own], state.u.numpy()[:, own] + state.vk.numpy()[:, own]
     total = mass.sum(1, dtype=float)
     return total, *(np.einsum("ep,epi->ei", mass, a.astype(float)) / total[:, None] for a in (x, v))
+
+
+def places_in(camera, points: np.ndarray, center=(0.0, 0.0)) -> np.ndarray:
+    """Return where a pinhole camera sees points: from -1 to 1 across a square picture, shape ``(n, 2)``."""
+    eye, target = np.array(camera.position), np.array(camera.target)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    seen = (points - eye - [*center, 0.0]) @ np.stack([right, np.cross(right, forward), forward]).T
+    assert (seen[:, 2] > 0.1).all()
+    return seen[:, :2] / seen[:, 2:] / math.tan(math.radians(0.5 * camera.field_of_view))
+
+
+def assert_all_is_seen(env, seeds=range(3)) -> None:
+    """Assert that pictures of new episodes hold all bodies and markers."""
+    batch, scenes = env.batch, SceneReader(env.batch)
+    for seed in seeds:
+        env.reset(seed=seed)
+        scene = scenes.scene(0)
+        points = [body.vertices for body in scene.bodies] + [marker.mesh()[0] for marker in scene.markers]
+        center = (0.0, 0.0) if scene.follow is None else scene.follow[:2]
+        seen = places_in(camera_of(batch), np.concatenate(points), center)
+        assert np.abs(seen).max() < 1.0
+        assert np.ptp(seen[:, 1]) > 0.3  # and not a dot

@@ -15,6 +15,7 @@ from piavatar_envs.config.schema import Place
 from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of, write_in_root
+from piavatar_envs.envs.framing import Sphere
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -368,6 +369,16 @@ class GateTask(Task):
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         density = self.ball_column(env, "density")
         return Drawn(density, self.gate.ball_volume), Drawn(self.length), Drawn(component(self.forward, 0))
+
+    def shown(self) -> list[Sphere]:
+        """Return avatar, ball, and the gate at its places."""
+        config, (x, y), spread = self.config, self.config.ball_place, self.config.target_angle
+        gates = [
+            (x + way * math.sin(angle), y - way * math.cos(angle), config.target_height, config.target_radius)
+            for way in config.target_distance
+            for angle in (-spread, 0.0, spread)
+        ]
+        return super().shown() + gates
 
     def domain(self) -> Domain:
         """Include the ball's first places and the ways through any gate, and no more, because memory grows with it.

@@ -14,6 +14,7 @@ from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
 from piavatar_envs.config import ConfigError, ControlConfig, PoseControlConfig
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.episodes import Episodes, Outcome
+from piavatar_envs.envs.framing import Sphere
 from piavatar_envs.envs.task import Metric, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.scene import Domain
@@ -33,6 +34,8 @@ from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action
 
 wp.set_module_options({"enable_backward": False})
 
+#: Heights of the marks at the corners of the ring, and their radius [m].
+POSTS, MARKER = (0.0, 0.45, 0.9, 1.35), 0.03
 _PARTS = tuple(BODY_PARTS)
 _HEAD, _TORSO = wp.constant(_PARTS.index("head")), wp.constant(_PARTS.index("torso"))
 _LEFT_ARM, _RIGHT_ARM = wp.constant(_PARTS.index("left_arm")), wp.constant(_PARTS.index("right_arm"))
@@ -222,8 +225,8 @@ class BoxingTask(RingTask):
         TaskArray("points", float, ("num_agents", "num_agents")),
     )
     stance_key = STANCE
-    camera_position = (3.7, -1.5, 1.8)
-    camera_target = (0.0, 0.0, 0.85)
+    camera_direction = (3.7, -0.9, 1.2)
+    camera_follows = False
 
     summary = """`num_agents` avatars stand on guard, `start_distance` apart around the centre of a square ring of
 `ring_size`, each displaced by up to `place_noise`; smooth walls stand in for the ropes. The trunk, the arms and the
@@ -253,6 +256,12 @@ for it to stay up. A good agent strikes fast, at the head, and withdraws."""
                 f"{need:.3g} m, more than ring_size={config.ring_size} m; use ring_size >= {need + 0.05:.2g}"
             )
 
+    def shown(self) -> list[Sphere]:
+        """Return avatars and ropes."""
+        side = 0.5 * self.config.ring_size
+        corners = [(x, y, z, MARKER) for x in (-side, side) for y in (-side, side) for z in POSTS]
+        return super().shown() + corners
+
     def domain(self) -> Domain:
         """Return the ring; the walls of the domain are the ropes."""
         side, box = 0.5 * self.config.ring_size, Domain()
@@ -272,8 +281,8 @@ for it to stay up. A good agent strikes fast, at the head, and withdraws."""
 
     def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
         side = 0.5 * self.config.ring_size
-        corners = [(x, y, z) for x in (-side, side) for y in (-side, side) for z in (0.0, 0.45, 0.9, 1.35)]
-        return [(np.array(corner), 0.03, (0.75, 0.20, 0.20)) for corner in corners]
+        corners = [(x, y, z) for x in (-side, side) for y in (-side, side) for z in POSTS]
+        return [(np.array(corner), MARKER, (0.75, 0.20, 0.20)) for corner in corners]
 
 
 TASK = BoxingTask

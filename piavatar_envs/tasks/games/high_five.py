@@ -234,8 +234,7 @@ class HighFiveTask(Task):
     scratch_arrays = tuple(TaskArray(name, wp.vec3, (2,)) for name in ("middle", "direction", "velocity"))
     observes_contact = True
     observes_others = True
-    camera_position = (2.9, -0.9, 1.75)
-    camera_target = (0.0, 0.0, 0.95)
+    camera_direction = (2.9, -0.9, 0.8)
 
     summary = """Two avatars stand face to face, `spacing` apart and each displaced by up to `place_noise`, with their
 arms down. Each has to raise its `hand` and slap the other's. It is a high five when the impulse of arm on arm, summed

@@ -301,8 +301,7 @@ class PassBallTask(Task):
     )
     observes_contact = True
     observes_others = True
-    camera_position = (3.9, 2.7, 2.4)
-    camera_target = (0.0, 0.0, 0.65)
+    camera_direction = (3.9, 2.7, 1.75)
     camera_follows = False
 
     summary = """`num_agents` avatars stand on a circle, `spacing` apart and facing its middle. From there a soft ball

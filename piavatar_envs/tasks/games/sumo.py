@@ -13,6 +13,7 @@ from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
 from piavatar_envs.config import ConfigError
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.episodes import Bones, Episodes, Outcome
+from piavatar_envs.envs.framing import Sphere
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Metric, Term
 from piavatar_envs.mpm.types import Sensors
@@ -49,6 +50,7 @@ STANCE = Key(
 #: Room beyond the ring, in which the avatars that are out lie, up to the walls of the domain [m].
 ROOM = 1.2
 RIM_MARKERS = 48
+MARKER = 0.03  # radius of one [m]
 
 
 class SumoConfig(RingConfig):
@@ -152,8 +154,8 @@ class SumoTask(RingTask):
         Metric("standing", "-", "number of agents that are still in"),
     )
     stance_key = STANCE
-    camera_position = (3.4, -3.0, 2.7)
-    camera_target = (0.0, 0.0, 0.5)
+    camera_direction = (3.4, -3.0, 2.2)
+    camera_follows = False
 
     summary = """`num_agents` avatars crouch `start_distance` apart around the centre of a ring of `ring_radius`, facing
 it, each displaced by up to `place_noise`. The trunk, the arms and the root act. A root that moves into another body
@@ -179,6 +181,12 @@ does not lose its balance."""
                 f"{self.start_radius + 0.3:.2g}"
             )
 
+    def shown(self) -> list[Sphere]:
+        """Return avatars and ring."""
+        turns = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+        rim = self.config.ring_radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+        return super().shown() + [(x, y, 0.0, MARKER) for x, y in rim.tolist()]
+
     def domain(self) -> Domain:
         side = self.config.ring_radius + ROOM
         height = Domain().upper[2]
@@ -202,7 +210,7 @@ does not lose its balance."""
     def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
         turns = 2.0 * np.pi * np.arange(RIM_MARKERS) / RIM_MARKERS
         rim = self.config.ring_radius * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=-1)
-        return [(at, 0.03, (0.85, 0.65, 0.30)) for at in rim]
+        return [(at, MARKER, (0.85, 0.65, 0.30)) for at in rim]
 
 
 TASK = SumoTask
