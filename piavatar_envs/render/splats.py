@@ -60,6 +60,7 @@ class Canvas(Protocol):
     views: wp.array  # View, (N,)
     color: wp.array  # vec3, sRGB in [0, 1], (N, H, W)
     nearest: wp.array  # inverse depth [1/m], 0 where nothing is, (N, H, W)
+    labels: wp.array | None  # subjects, (N, H, W) uint8
 
 
 @wp.struct
@@ -289,6 +290,26 @@ def mark_words(
     words[row, tile, at] = bits
 
 
+@wp.func
+def put_in_front(
+    row: int,
+    picture: int,
+    y: int,
+    x: int,
+    front: int,
+    records: Records,
+    subjects: wp.array[wp.uint8],
+    order: wp.array[int],
+    nearest: wp.array3d[float],
+    labels: wp.array3d[wp.uint8],
+):
+    """Write depth and subject of the sorted splat that takes half of the light, unless it is -1."""
+    if front >= 0:
+        nearest[picture, y, x] = records.tint[row, front][3]
+        if labels.shape[0] > 0:
+            labels[picture, y, x] = subjects[order[row * records.tint.shape[1] + front]]
+
+
 @wp.kernel
 def blend_tiles(
     # in
@@ -299,9 +320,12 @@ def blend_tiles(
     masks: wp.array3d[wp.uint32],
     words: wp.array3d[wp.uint32],
     records: Records,
+    subjects: wp.array[wp.uint8],
+    order: wp.array[int],
     # in, out
     color: wp.array3d[wp.vec3],
     nearest: wp.array3d[float],
+    labels: wp.array3d[wp.uint8],
 ):
     """Blend the splats of a tile over the picture, a pixel a thread and a tile a CUDA block."""
     thread = wp.tid()
@@ -320,7 +344,7 @@ def blend_tiles(
         surface = nearest[picture, y, x]
         light = wp.vec3(0.0)
         transmittance = float(1.0)
-        depth = float(surface)
+        front = int(-1)
         at = int(0)
         while at < words.shape[2]:
             some = words[row, tile, at]
@@ -344,11 +368,11 @@ def blend_tiles(
                             else:
                                 light += (transmittance * alpha) * wp.vec3(tint[0], tint[1], tint[2])
                                 if transmittance >= 0.5 and left < 0.5:
-                                    depth = tint[3]
+                                    front = i
                                 transmittance = left
             at += 1
         color[picture, y, x] = light + transmittance * color[picture, y, x]
-        nearest[picture, y, x] = depth
+        put_in_front(row, picture, y, x, front, records, subjects, order, nearest, labels)
 
 
 @wp.kernel
@@ -359,7 +383,7 @@ def blend_splats(
     nearest: wp.array3d[float],
     # out
     light: wp.array3d[wp.vec4],  # colour, and transmittance: its negative where nothing more is blended
-    front: wp.array3d[float],  # inverse depth where half of the light is lost [1/m], 0 where it is not
+    front: wp.array3d[int],  # sorted splat that takes half of the light, or -1
 ):
     """Blend the splats of a picture one after another, a picture a thread."""
     row = wp.tid()
@@ -368,7 +392,7 @@ def blend_splats(
     for y in range(height):
         for x in range(width):
             light[row, y, x] = wp.vec4(0.0, 0.0, 0.0, 1.0)
-            front[row, y, x] = 0.0
+            front[row, y, x] = -1
     for i in range(records.place.shape[1]):
         place = records.place[row, i]
         pixels = covered(place, width, height)
@@ -391,7 +415,7 @@ def blend_splats(
                                 left,
                             )
                             if before[3] >= 0.5 and left < 0.5:
-                                front[row, y, x] = tint[3]
+                                front[row, y, x] = i
 
 
 @wp.kernel
@@ -399,18 +423,21 @@ def lay_over(
     # in
     first: int,
     light: wp.array3d[wp.vec4],
-    front: wp.array3d[float],
+    front: wp.array3d[int],
+    records: Records,
+    subjects: wp.array[wp.uint8],
+    order: wp.array[int],
     # in, out
     color: wp.array3d[wp.vec3],
     nearest: wp.array3d[float],
+    labels: wp.array3d[wp.uint8],
 ):
     """Lay the blended splats over the picture."""
     row, y, x = wp.tid()
     own = light[row, y, x]
     picture = first + row
     color[picture, y, x] = wp.vec3(own[0], own[1], own[2]) + wp.abs(own[3]) * color[picture, y, x]
-    if front[row, y, x] > 0.0:
-        nearest[picture, y, x] = front[row, y, x]
+    put_in_front(row, picture, y, x, front[row, y, x], records, subjects, order, nearest, labels)
 
 
 class SplatPainter:
@@ -422,6 +449,7 @@ class SplatPainter:
         turns: rotations from the frame of the colours to the world, ``(N, S)``.
         opacities: in [0, 1], ``(S,)``.
         harmonics: of the colours, vec3 ``(S, K)``, ``K`` of 1, 4, 9 or 16: ``0.5 + sum Y_k c_k``.
+        subjects: labels, ``(S,)`` uint8.
     """
 
     def __init__(
@@ -434,6 +462,7 @@ class SplatPainter:
         device: str,
         *,
         motion: tuple[wp.array, wp.array, wp.array] | None = None,
+        subjects: np.ndarray | None = None,
         tiled: bool | None = None,
     ) -> None:
         """Allocate all arrays.
@@ -446,6 +475,7 @@ class SplatPainter:
             width: of a picture [px].
             device: to draw on.
             motion: arrays to read means, covariances and turns from; by default own ones.
+            subjects: labels of the splats, shape ``(S,)``; 0 by default.
             tiled: whether to draw by tiles; by default on a GPU.
 
         Raises:
@@ -460,6 +490,8 @@ class SplatPainter:
         self.device, self.num_splats = device, count
         self.opacities = wp.array(np.asarray(opacities), dtype=float, device=device)
         self.harmonics = wp.array(np.asarray(harmonics), dtype=wp.vec3, device=device)
+        subjects = np.zeros(count) if subjects is None else subjects
+        self.subjects = wp.array(np.asarray(subjects, np.uint8), dtype=wp.uint8, device=device)
         rows = (num_pictures, count)
         self.means, self.covariances, self.turns = motion or (
             wp.zeros(rows, dtype=wp.vec3, device=device),
@@ -482,13 +514,16 @@ class SplatPainter:
         else:
             shape = (self.chunk, height, width)
             self._light = wp.zeros(shape, dtype=wp.vec4, device=device)
-            self._front = wp.zeros(shape, dtype=float, device=device)
+            self._front = wp.zeros(shape, dtype=int, device=device)
 
     def record(self, graph: LaunchGraph, canvas: Canvas) -> None:
         """Append the launches that blend the splats over the pictures of a canvas.
 
-        ``canvas.nearest`` becomes the inverse depth of the splat that takes half of the light, where there is one.
+        ``canvas.nearest`` and ``canvas.labels`` become those of the splat that takes half of the light, where there is
+        one.
         """
+        labels = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device) if canvas.labels is None else canvas.labels
+        out = [canvas.color, canvas.nearest, labels]
         for first in range(0, self.num_pictures, self.chunk):
             rows = min(self.chunk, self.num_pictures - first)
             splats = (rows, self.num_splats)
@@ -498,14 +533,14 @@ class SplatPainter:
             motion = [self.means, self.covariances, self.turns, self.opacities, self.harmonics]
             graph.launch(project_splats, splats, [first, canvas.views, *motion, self._order], [self._records])
             if self.tiled:
-                self._record_tiles(graph, canvas, first, rows)
+                self._record_tiles(graph, first, rows, out)
             else:
                 blended = [self._light, self._front]
                 graph.launch(blend_splats, rows, [first, self._records, canvas.nearest], blended)
                 pixels = (rows, self.height, self.width)
-                graph.launch(lay_over, pixels, [first, *blended], [canvas.color, canvas.nearest])
+                graph.launch(lay_over, pixels, [first, *blended, self._records, self.subjects, self._order], out)
 
-    def _record_tiles(self, graph: LaunchGraph, canvas: Canvas, first: int, rows: int) -> None:
+    def _record_tiles(self, graph: LaunchGraph, first: int, rows: int, out: list[wp.array]) -> None:
         size = [self.width, self.height]
         tiles, words = self._masks.shape[1:]
         for first_row in range(0, -(-self.height // TILE), self.tile_rows):
@@ -514,7 +549,7 @@ class SplatPainter:
             graph.launch(
                 blend_tiles,
                 rows * tiles * TILE * TILE,
-                [first, *size, first_row, self._masks, self._words, self._records],
-                [canvas.color, canvas.nearest],
+                [first, *size, first_row, self._masks, self._words, self._records, self.subjects, self._order],
+                out,
                 block_dim=TILE * TILE,
             )

@@ -29,11 +29,11 @@ def view(eye=EYE, axes=AXES, width=WIDTH, height=HEIGHT) -> View:
     return row
 
 
-def draw(device, views, means, covariances, colors, opacities, turns=None, background=0.2, nearest=0.0, tiled=None):
-    """Return colours and inverse depths of pictures; ``colors`` are ``(S, 3)``, or harmonics ``(S, K, 3)``."""
+def draw(device, views, means, covariances, colors, opacities, turns=None, background=0.2, nearest=0.0, **more):
+    """Return colours, inverse depths and labels; ``colors`` are ``(S, 3)``, or harmonics ``(S, K, 3)``."""
     colors = np.asarray(colors, dtype=float)
     harmonics = colors if colors.ndim == 3 else ((colors - 0.5) / SH0)[:, None]
-    painter = SplatPainter(opacities, harmonics, len(views), HEIGHT, WIDTH, device, tiled=tiled)
+    painter = SplatPainter(opacities, harmonics, len(views), HEIGHT, WIDTH, device, **more)
     rows = (len(views), *np.shape(means)[-2:])
     painter.means.assign(np.broadcast_to(means, rows))
     packed = np.asarray(covariances)[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
@@ -45,11 +45,12 @@ def draw(device, views, means, covariances, colors, opacities, turns=None, backg
         views=wp.array(views, dtype=View, device=device),
         color=wp.array(np.broadcast_to(np.float32(background), (*pictures, 3)), dtype=wp.vec3, device=device),
         nearest=wp.array(np.broadcast_to(np.float32(nearest), pictures), dtype=float, device=device),
+        labels=wp.full(pictures, 9, dtype=wp.uint8, device=device),
     )
     graph = LaunchGraph(device)
     painter.record(graph, canvas)
     graph.run()
-    return canvas.color.numpy(), canvas.nearest.numpy()
+    return canvas.color.numpy(), canvas.nearest.numpy(), canvas.labels.numpy()
 
 
 def cloud(count: int, seed: int = 0):
@@ -84,7 +85,7 @@ def reference(means, covariances, colors, opacities, background, nearest, eye=EY
 
 def test_one_gaussian_is_its_analytic_image(device):
     # A sphere of 0.2 m seen from 3 m at the axis: an isotropic Gaussian of (0.2 focal / 3)^2 + 0.3 px^2.
-    color, depth = draw(device, [view()], [[0, 0, 0]], [0.04 * np.eye(3)], [[1.0, 0.5, 0.0]], [0.8])
+    color, depth, _ = draw(device, [view()], [[0, 0, 0]], [0.04 * np.eye(3)], [[1.0, 0.5, 0.0]], [0.8])
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     square = (rows - HEIGHT / 2) ** 2 + (columns - WIDTH / 2) ** 2
     alpha = 0.8 * np.exp(-0.5 * square / ((0.2 * FOCAL / 3) ** 2 + 0.3))
@@ -100,7 +101,7 @@ def test_many_gaussians_equal_a_slow_reference(device):
     turn = Rotation.from_euler("zxy", [40, -20, 10], degrees=True)
     eye, axes = turn.apply(EYE), turn.apply(AXES)
     nearest = np.where(np.arange(WIDTH) < WIDTH // 2, 0.0, 1 / 3.1)
-    color, _ = draw(device, [view(eye, axes)], means, covariances, colors, opacities, nearest=nearest)
+    color, _, _ = draw(device, [view(eye, axes)], means, covariances, colors, opacities, nearest=nearest)
     expected = reference(means, covariances, colors, opacities, 0.2, nearest, eye, axes)
     np.testing.assert_allclose(color[0], expected, atol=1e-4)
     assert np.abs(expected - 0.2).max(axis=-1).mean() > 0.1  # there is something to see
@@ -111,7 +112,7 @@ def test_a_surface_hides_what_is_behind_it(device):
     colors, opacities = [[1, 0, 0], [0, 1, 0]], [0.9, 0.6]
     center = (0, HEIGHT // 2, WIDTH // 2)
     for surface, hidden in ((1 / 4.0, ()), (1 / 3.0, (0,)), (1 / 2.0, (0, 1))):
-        color, depth = draw(device, [view()], means, covariances, colors, opacities, background=0.5, nearest=surface)
+        color, depth, _ = draw(device, [view()], means, covariances, colors, opacities, background=0.5, nearest=surface)
         left = [i for i in range(2) if i not in hidden]
         expected = reference(*(np.array(a)[left] for a in (means, covariances, colors, opacities)), 0.5, 0.0)
         np.testing.assert_allclose(color[center], expected[center[1:]], atol=1e-5)
@@ -146,8 +147,16 @@ def test_colour_turns_with_the_splat(device):
         # the eye looks along y: turned by 90 degrees about z, that is along x of the rest frame
         turn = Rotation.from_euler("z", degrees, degrees=True).as_quat()
         given = ([[0, 0, 0]], [0.5 * np.eye(3)], harmonics, [0.99])
-        color, _ = draw(device, [view()], *given, turns=turn, background=0.0)
+        color, _, _ = draw(device, [view()], *given, turns=turn, background=0.0)
         assert color[0, HEIGHT // 2, WIDTH // 2, 1] == pytest.approx(0.99 * expected, abs=2e-3)
+
+
+def test_labels_are_those_of_what_takes_half_of_the_light(device):
+    means, covariances = [[-0.4, 0.0, 0], [0.4, -0.2, 0], [0.4, 0.2, 0]], [0.01 * np.eye(3)] * 3
+    given = (means, covariances, np.ones((3, 3)), [0.9, 0.3, 0.9])
+    _, _, labels = draw(device, [view()], *given, subjects=[1, 2, 3])
+    row = labels[0, HEIGHT // 2]
+    assert (row[0], row[WIDTH // 2 - 8], row[WIDTH // 2 + 8]) == (9, 1, 3)
 
 
 def test_opacity_has_limits(device):
@@ -165,7 +174,7 @@ def test_what_is_not_a_number_or_out_of_sight_is_not_drawn(device):
     means = [[np.nan, 0, 0], [0, 0, 0], [0, -3.1, 0], [0, -2.9, 0], [0, 9e3, 0], [0, 0, 0], [500.0, 0, 0]]
     covariances = [np.eye(3), np.full((3, 3), np.nan), *(4 * [np.eye(3)]), 1e-4 * np.eye(3)]
     opacities = [1, 1, 1, 1, 1, 0, 1]
-    color, depth = draw(device, [view()], means, covariances, 7 * [[1, 1, 1]], opacities, nearest=0.01)
+    color, depth, _ = draw(device, [view()], means, covariances, 7 * [[1, 1, 1]], opacities, nearest=0.01)
     assert (color == np.float32(0.2)).all() and (depth == np.float32(0.01)).all()
 
 
