@@ -2,11 +2,11 @@
 
 A recording is of any environment of the suite, whatever chooses its actions::
 
-    recording = Recording(env)
+    recording = Recording(env, Path("reach"), "glb")
     for _ in range(100):
         env.step(policy(observation))
         recording.add()
-    recording.write(Path("reach"), "glb")
+    recording.finish()
 """
 
 from __future__ import annotations
@@ -18,54 +18,55 @@ from typing import Any, Literal
 from piavatar_envs.api.pictures import SceneReader
 from piavatar_envs.core.writing import check_writable
 from piavatar_envs.play import Rollout, check_agent, check_steps, frames, make, settings_of
-from piavatar_envs.render.film import Film
-from piavatar_envs.render.film_files import check_format, write_film
+from piavatar_envs.render.film_files import check_format, film_writer
 
 
 class Recording:
-    """The scenes of one environment in time.
+    """The scenes of one environment in time, written to files.
 
     Attributes:
-        film: the meshes so far.
+        writer: of the files.
     """
 
-    def __init__(self, env: Any, index: int = 0, color: Literal["skin", "strain"] = "skin") -> None:
+    def __init__(
+        self,
+        env: Any,
+        folder: Path,
+        kind: str = "glb",
+        index: int = 0,
+        color: Literal["skin", "strain"] = "skin",
+    ) -> None:
         """Begin without a frame.
 
         Args:
             env: an environment of the suite, of one agent or several, or a vector of environments.
+            folder: new, or empty.
+            kind: "glb", "ply" or "usd".
             index: which one of a vector.
             color: of the bodies.
 
         Raises:
-            ValueError: there is no such environment.
+            ImportError: usd-core is not installed, for USD.
+            ValueError: there is no such environment or format, or the folder holds something.
         """
         batch = env.unwrapped.batch
         if not 0 <= index < batch.num_envs:
             raise ValueError(f"index={index} is outside [0, {batch.num_envs - 1}]")
+        check_folder(folder)
+        self.writer = film_writer(folder, kind, 1.0 / batch.config.physics.control_dt)
         self._scenes, self._index, self._color = SceneReader(batch), index, color
-        self.film = Film(1.0 / batch.config.physics.control_dt)
 
     def add(self) -> None:
         """Append what there is to see now, as the next frame: one a step in real time."""
-        self.film.add(self._scenes.scene(self._index, self._color))
+        self.writer.add(self._scenes.scene(self._index, self._color))
 
-    def write(self, folder: Path, kind: str) -> list[Path]:
-        """Write what was recorded, see :func:`piavatar_envs.render.film_files.write_film`.
-
-        Args:
-            folder: new, or empty.
-            kind: "glb", "ply" or "usd".
-
-        Returns:
-            The files, or the folders of files.
+    def finish(self) -> list[Path]:
+        """Write what is not written yet, and return the files, or the folders of files.
 
         Raises:
-            ImportError: usd-core is not installed, for USD.
-            ValueError: the folder holds something, there is no frame, or the format is unknown or cannot hold it.
+            ValueError: there is no frame, or the format cannot hold the film.
         """
-        check_folder(folder)
-        return write_film(self.film, folder, kind)
+        return self.writer.finish()
 
 
 def export(
@@ -111,12 +112,12 @@ def export(
     env = make(env_id, settings_of(device, overrides))
     rollout = Rollout()
     try:
-        recording = Recording(env, color=color)
+        recording = Recording(env, folder, kind, color=color)
         for _ in frames(env, agent, steps, seed, rollout):
             recording.add()
     finally:
         env.close()
-    return rollout, recording.write(folder, kind)
+    return rollout, recording.finish()
 
 
 def check_folder(folder: Path) -> None:

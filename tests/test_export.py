@@ -13,18 +13,19 @@ from piavatar_envs.export import Recording, export
 def test_a_recording_has_the_skin_of_every_state(make_env, tmp_path):
     env = make_env("PIAvatar/Reach-v0")
     env.reset(seed=0)
-    recording, skins = Recording(env), []
+    recording, skins = Recording(env, tmp_path / "film"), []
     for _ in range(3):
         env.step(env.action_space.sample())
         recording.add()
         skins.append(recording._scenes.scene(0).bodies[0].vertices)
-    gltf = read_gltf(recording.write(tmp_path / "film", "glb")[0])
+    gltf = read_gltf(recording.finish()[0])
     primitive = gltf.json["meshes"][0]["primitives"][0]
     base = gltf.accessor(primitive["attributes"]["POSITION"])
     for skin, target in zip(skins, (0.0, *primitive["targets"]), strict=True):
         moved = base + (gltf.accessor(target["POSITION"]) if target else 0.0)
         np.testing.assert_allclose(moved[:, [0, 2, 1]] * [1, -1, 1], skin, atol=1e-5)
-    assert recording.film.rate == pytest.approx(1.0 / env.config.physics.control_dt)
+    sampler = gltf.json["animations"][0]["samplers"][0]
+    np.testing.assert_allclose(np.diff(gltf.accessor(sampler["input"])[:, 0]), env.config.physics.control_dt, rtol=1e-5)
 
 
 def test_command_exports_a_game(tmp_path, capsys):

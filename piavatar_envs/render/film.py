@@ -51,8 +51,6 @@ class Moving:
         last = next((kept for kept in reversed(self.colors) if kept is not None), None)
         if last is not None and np.array_equal(last, color):
             color = last
-        # of a failed simulation, too, which programs would not read otherwise
-        shape = np.nan_to_num(np.asarray(shape, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
         self.shapes += [*(missing * [None]), shape]
         self.colors += [*(missing * [None]), color]
 
@@ -75,19 +73,14 @@ class Film:
             raise ValueError(f"rate={rate} must be positive: it is the frames of a second")
         self.rate = rate
         self.num_frames = 0
-        self._meshes: dict[tuple[str, int, bytes], Moving] = {}
+        self._names = Names()
+        self._meshes: dict[str, Moving] = {}
 
     def add(self, scene: Scene) -> None:
-        """Append a frame.
-
-        A mesh goes on that has the same place in the scene and the same triangles; another one begins anew.
-        """
-        for name, vertices, faces, color in _meshes(scene):
-            key = (name, len(vertices), np.ascontiguousarray(faces).tobytes())
-            if key not in self._meshes:
-                others = sum(other[0] == name for other in self._meshes)
-                self._meshes[key] = Moving(f"{name}_{others}" if others else name, np.asarray(faces))
-            self._meshes[key].append(self.num_frames, vertices, color)
+        """Append a frame."""
+        for name, vertices, faces, color in self._names.meshes(scene):
+            mesh = self._meshes.setdefault(name, Moving(name, np.asarray(faces)))
+            mesh.append(self.num_frames, vertices, color)
         self.num_frames += 1
 
     @property
@@ -100,8 +93,30 @@ class Film:
         return list(self._meshes.values())
 
 
+class Names:
+    """Names of meshes in a series of scenes.
+
+    A mesh that has the same place in the scene and the same triangles keeps its name; others are numbered.
+    """
+
+    def __init__(self) -> None:
+        """Begin without names."""
+        self._known: dict[tuple[str, int, bytes], str] = {}
+
+    def meshes(self, scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
+        """Yield name, vertices, triangles and colours (sRGB, uint8) of everything in the next scene."""
+        for place, vertices, faces, color in _meshes(scene):
+            key = (place, len(vertices), np.ascontiguousarray(faces).tobytes())
+            if key not in self._known:
+                others = sum(other[0] == place for other in self._known)
+                self._known[key] = f"{place}_{others}" if others else place
+            # programs would not read what a failed simulation has
+            vertices = np.nan_to_num(np.asarray(vertices, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+            yield self._known[key], vertices, faces, color
+
+
 def _meshes(scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield name, vertices, triangles and colours of everything in a scene; names persist between scenes."""
+    """Yield place in the scene, vertices, triangles and colours of everything in it."""
     for index, body in enumerate(scene.bodies):
         yield f"body_{index}", body.vertices, body.faces, _colors_of(body)
     for index, marker in enumerate(scene.markers):

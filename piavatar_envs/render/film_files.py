@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from piavatar_envs.core.extras import missing
 from piavatar_envs.render.coloring import srgb_to_linear
-from piavatar_envs.render.film import Film, Moving
+from piavatar_envs.render.film import Film, Moving, Names
+from piavatar_envs.render.scene import Scene
 
 FORMATS = ("glb", "ply", "usd")
 #: Of a file [bytes]: what the suite's own reader accepts.
@@ -29,29 +29,32 @@ _FLOAT, _UINT32, _UINT16 = 5126, 5125, 5123
 _LINEAR, _STEP = "LINEAR", "STEP"
 
 
-def write_film(film: Film, folder: Path, kind: str) -> list[Path]:
-    """Write a film into a folder, which is made.
+class FilmWriter(Protocol):
+    """Writes a series of scenes into a folder."""
+
+    def add(self, scene: Scene) -> None:
+        """Append a frame."""
+        ...
+
+    def finish(self) -> list[Path]:
+        """Write what is not written yet, and return the files, or the folders of files."""
+        ...
+
+
+def film_writer(folder: Path, kind: str, rate: float) -> FilmWriter:
+    """Return the writer of a format.
 
     Args:
-        film: with a frame at least.
-        folder: for ``film.glb``, ``film.usdc`` or ``MESH/0000.ply``.
+        folder: for ``film.glb``, ``film.usdc`` or ``MESH/0000.ply``; it is made when it is written to.
         kind: one of :data:`FORMATS`.
-
-    Returns:
-        The files, or for PLY the folders of the meshes.
+        rate: frames a second [1/s].
 
     Raises:
         ImportError: usd-core is not installed, for USD.
-        ValueError: an unknown format, a film without frames, or one that is too long or has colours that change, for
-            glTF.
-        OSError: the folder cannot be written.
+        ValueError: an unknown format, or a rate that is not positive.
     """
     check_format(kind)
-    if film.num_frames == 0 or not film.meshes:
-        raise ValueError("this film shows nothing; add a scene first")
-    folder.mkdir(parents=True, exist_ok=True)
-    write: dict[str, Callable[[Film, Path], list[Path]]] = {"glb": _write_glb, "ply": _write_plys, "usd": _write_usd}
-    return write[kind](film, folder)
+    return PlyWriter(folder) if kind == "ply" else WholeWriter(folder, kind, rate)
 
 
 def check_format(kind: str) -> None:
@@ -117,7 +120,8 @@ class _Glb:
             stream.writelines(self._content)
 
 
-def _write_glb(film: Film, folder: Path) -> list[Path]:
+def write_glb(film: Film, folder: Path) -> Path:
+    """Write ``film.glb`` and return its path; raises as :meth:`WholeWriter.finish`."""
     needed = sum(24 * len(shape) for mesh in film.meshes for shape in mesh.shapes if shape is not None)
     if needed > MAX_GLB:
         raise ValueError(f"a glTF file of {film.num_frames} frames has {needed:.1e} bytes, 2^31 at most; export fewer")
@@ -150,7 +154,7 @@ def _write_glb(film: Film, folder: Path) -> list[Path]:
         glb.document["animations"] = [{"name": "film", "samplers": samplers, "channels": channels}]
     path = folder / "film.glb"
     glb.write(path)
-    return [path]
+    return path
 
 
 def _add_mesh(glb: _Glb, mesh: Moving) -> np.ndarray:
@@ -198,15 +202,60 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(size > 1e-20, normals / np.maximum(size, 1e-20), (0.0, 0.0, 1.0))
 
 
-def _write_plys(film: Film, folder: Path) -> list[Path]:
-    folders = []
-    for mesh in film.meshes:
-        folders.append(folder / mesh.name)
-        folders[-1].mkdir(exist_ok=True)
-        for frame, (shape, color) in enumerate(zip(mesh.shapes, mesh.colors, strict=True)):
-            if shape is not None:
-                write_mesh_ply(folders[-1] / f"{frame:04d}.ply", shape, mesh.faces, color)
-    return folders
+class WholeWriter:
+    """Writes one file when all frames are there: glTF or USD."""
+
+    def __init__(self, folder: Path, kind: str, rate: float) -> None:
+        """Begin without frames."""
+        self._folder, self._write = folder, {"glb": write_glb, "usd": write_usd}[kind]
+        self._film = Film(rate)
+
+    def add(self, scene: Scene) -> None:
+        """Append a frame."""
+        self._film.add(scene)
+
+    def finish(self) -> list[Path]:
+        """Write the file.
+
+        Raises:
+            ValueError: a film without frames, or one that is too long or has colours that change, for glTF.
+            OSError: the folder cannot be written.
+        """
+        if self._film.num_frames == 0 or not self._film.meshes:
+            raise ValueError("this film shows nothing; add a scene first")
+        self._folder.mkdir(parents=True, exist_ok=True)
+        return [self._write(self._film, self._folder)]
+
+
+class PlyWriter:
+    """Writes the files of every frame at once."""
+
+    def __init__(self, folder: Path) -> None:
+        """Begin without frames."""
+        self._folder, self._names = folder, Names()
+        self._num_frames = 0
+        self._folders: dict[str, Path] = {}
+
+    def add(self, scene: Scene) -> None:
+        """Write a frame.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        for name, vertices, faces, colors in self._names.meshes(scene):
+            write_mesh_ply(self._file(name), vertices, faces, colors)
+        self._num_frames += 1
+
+    def finish(self) -> list[Path]:
+        """Return the folders of the meshes."""
+        return list(self._folders.values())
+
+    def _file(self, name: str) -> Path:
+        """Return the file of something in this frame; its folder is made."""
+        if name not in self._folders:
+            self._folders[name] = self._folder / name
+            self._folders[name].mkdir(parents=True, exist_ok=True)
+        return self._folders[name] / f"{self._num_frames:04d}.ply"
 
 
 def write_mesh_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray) -> None:
@@ -232,8 +281,8 @@ def write_mesh_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colors: 
         stream.write(triangles.tobytes())
 
 
-def _write_usd(film: Film, folder: Path) -> list[Path]:
-    """Write ``film.usdc``: a mesh prim each, with points, colours and visibility by time."""
+def write_usd(film: Film, folder: Path) -> Path:
+    """Write ``film.usdc`` and return its path: mesh prims with points, colours and visibility by time."""
     pxr = _import_usd()
     geometry, arrays = pxr.UsdGeom, pxr.Vt
     path = folder / "film.usdc"
@@ -269,7 +318,7 @@ def _write_usd(film: Film, folder: Path) -> list[Path]:
                 display.Set(arrays.Vec3fArray.FromNumpy(np.ascontiguousarray(light)), frame)
             before = (shape, color)
     stage.Export(str(path))
-    return [path]
+    return path
 
 
 def _import_usd() -> ModuleType:

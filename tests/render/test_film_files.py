@@ -9,8 +9,7 @@ import pytest
 
 from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.render.coloring import color_by, linear_to_srgb
-from piavatar_envs.render.film import Film
-from piavatar_envs.render.film_files import write_film
+from piavatar_envs.render.film_files import film_writer
 from piavatar_envs.render.scene import Body, Box, Scene, Sphere
 
 RATE, FRAMES = 25.0, 6
@@ -25,17 +24,17 @@ def shape(frame: int) -> np.ndarray:
     return bent.astype(np.float32)
 
 
-def film(**body) -> Film:
-    """A body that moves, a box that stays, and a sphere in two of the frames."""
-    result = Film(RATE)
+def write(folder, kind: str, **body) -> list:
+    """Write a body that moves, a box that stays, and a sphere in two of the frames."""
+    writer = film_writer(folder, kind, RATE)
     for frame in range(FRAMES):
         markers = [Box(np.zeros(3), np.ones(3))]
         if frame in (2, 4):
             markers.append(Sphere(np.array([0.5 * frame, 0.0, 1.0]), 0.1))
         if "scalars" in body:
             body["scalars"] = np.full(4, 0.1 * frame)
-        result.add(Scene([Body(shape(frame), FACES, **(body or {"colors": COLORS}))], markers))
-    return result
+        writer.add(Scene([Body(shape(frame), FACES, **(body or {"colors": COLORS}))], markers))
+    return writer.finish()
 
 
 def z_up(points: np.ndarray) -> np.ndarray:
@@ -59,7 +58,7 @@ def played(gltf, node: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_gltf_plays_the_same_positions(tmp_path):
-    (path,) = write_film(film(), tmp_path / "new", "glb")
+    (path,) = write(tmp_path / "new", "glb")
     gltf = read_gltf(path)
     assert gltf.names == ["body_0", "box_0", "sphere_1"]
     positions, times = played(gltf, 0)
@@ -75,7 +74,7 @@ def test_gltf_plays_the_same_positions(tmp_path):
 
 
 def test_gltf_keeps_colours_triangles_and_smooth_normals(tmp_path):
-    gltf = read_gltf(write_film(film(), tmp_path, "glb")[0])
+    gltf = read_gltf(write(tmp_path, "glb")[0])
     primitive = gltf.json["meshes"][0]["primitives"][0]
     colors = gltf.accessor(primitive["attributes"]["COLOR_0"])
     np.testing.assert_allclose(linear_to_srgb(colors[:, :3]) * 255.0, COLORS, atol=0.3)
@@ -91,7 +90,7 @@ def test_gltf_keeps_colours_triangles_and_smooth_normals(tmp_path):
 
 def test_ply_has_a_file_for_each_mesh_and_frame(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    folders = write_film(film(scalars=None), tmp_path, "ply")
+    folders = write(tmp_path, "ply", scalars=None)
     assert [folder.name for folder in folders] == ["body_0", "box_0", "sphere_1"]
     assert sorted(file.name for file in folders[2].iterdir()) == ["0002.ply", "0004.ply"]
     for frame in range(FRAMES):
@@ -106,7 +105,7 @@ def test_usd_has_points_colours_and_visibility_in_time(tmp_path):
     usd = pytest.importorskip("pxr.Usd", reason="needs the extra usd")
     from pxr import UsdGeom
 
-    stage = usd.Stage.Open(str(write_film(film(), tmp_path, "usd")[0]))
+    stage = usd.Stage.Open(str(write(tmp_path, "usd")[0]))
     assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (RATE, FRAMES - 1)
     assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     body, sphere = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/film/{name}")) for name in ("body_0", "sphere_1"))
@@ -120,16 +119,16 @@ def test_usd_has_points_colours_and_visibility_in_time(tmp_path):
 
 def test_films_that_cannot_be_written_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="colours that change"):
-        write_film(film(scalars=None), tmp_path, "glb")
+        write(tmp_path, "glb", scalars=None)
     with pytest.raises(ValueError, match="no format"):
-        write_film(film(), tmp_path, "fbx")
+        write(tmp_path, "fbx")
     with pytest.raises(ValueError, match="shows nothing"):
-        write_film(Film(RATE), tmp_path, "ply")
+        film_writer(tmp_path, "glb", RATE).finish()
+    with pytest.raises(ValueError, match="rate"):
+        film_writer(tmp_path, "glb", 0.0)
     monkeypatch.setattr("piavatar_envs.render.film_files.MAX_GLB", 1000)
     with pytest.raises(ValueError, match="export fewer"):
-        write_film(film(), tmp_path, "glb")
+        write(tmp_path, "glb")
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(ImportError, match="usd"):
-        write_film(film(), tmp_path, "usd")
-    with pytest.raises(ValueError, match="rate"):
-        Film(0.0)
+        write(tmp_path, "usd")
