@@ -1,196 +1,281 @@
-"""Kernels of the software renderer: triangles into samples, samples and the ground into a picture."""
+"""Triangles into samples: the nearest front that each sample of a picture shows.
+
+A sample's key has the inverse depth in its upper half and the triangle in its lower half, so that the greatest key is
+the nearest triangle whatever the order of the threads. Edges are evaluated in the plane of the picture, in the same
+way from both sides, so that no sample between two triangles is lost (J. Pineda, "A parallel algorithm for polygon
+rasterization", 1988). Triangles that reach before the near plane are intersected with the samples' rays instead.
+"""
 
 from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.render import ground
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render.shadows import Threads, is_shown
+from piavatar_envs.render.surfaces import Surfaces
+from piavatar_envs.render.views import View, ray_of, to_camera
 
-SAMPLES = wp.constant(2)  # along each side of a pixel
-_NEAR = wp.constant(0.05)
-_SQUARE = wp.constant(ground.SQUARE)
-_LINE_SHARE = wp.constant(2.0 * ground.LINE_PIXELS / ground.TILE_PIXELS)
-_FADE_START, _FADE_END = wp.constant(ground.FADE_START), wp.constant(ground.FADE_END)
-_GROUND_HEIGHT = wp.constant(ground.HEIGHT)
+# Fused products would be rounded differently from the two sides of an edge.
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-
-@wp.struct
-class View:
-    """A perspective camera: the eye, its axes (right, up, forward), focal length in sample widths, picture size."""
-
-    eye: wp.vec3
-    right: wp.vec3
-    up: wp.vec3
-    forward: wp.vec3
-    focal: float
-    width: int
-    height: int
+#: Surfaces nearer than this are not drawn [m].
+NEAR = wp.constant(0.05)
+_MOST = wp.constant(1.0 / 0.05)
+#: Samples of a triangle's frame above which the threads of a GPU share it, and such triangles of a picture at most.
+_LARGE, _MOST_LARGE = 1024, 8192
+_LANES = wp.constant(32)
+#: Samples along one side of a picture at most, as a bound of what a float becomes an integer for.
+_FAR_OUT = wp.constant(1.0e6)
 
 
 @wp.struct
-class GroundLook:
-    """Colours (sRGB in [0, 255]) and the shadow's patch."""
+class Frame:
+    """A triangle in a picture: corners (samples to the right and down, inverse depth [1/m]) and the samples around.
 
-    light: wp.vec3
-    dark: wp.vec3
-    line: wp.vec3
-    sky_top: wp.vec3
-    sky_bottom: wp.vec3
-    shadow: wp.vec3
-    center: wp.vec2
-    shadow_origin: wp.vec2
-    shadow_size: float
+    ``kind`` is 0 where nothing shows, 1 where it is drawn in the picture's plane, 2 where by rays.
+    """
+
+    kind: int
+    a: wp.vec3
+    b: wp.vec3
+    c: wp.vec3
+    left: int
+    right: int
+    top: int
+    bottom: int
 
 
 @wp.func
-def project(view: View, point: wp.vec3) -> wp.vec3:
-    """Sample coordinates (x right, y down) and the inverse depth [1/m], which is linear on the screen."""
-    offset = point - view.eye
-    inverse = 1.0 / wp.max(wp.dot(offset, view.forward), 1.0e-6)
+def on_screen(view: View, samples: float, at: wp.vec3) -> wp.vec3:
+    """Return sample coordinates, x to the right and y down, and the inverse depth [1/m], of a point before the eye."""
+    inverse = 1.0 / at[2]
+    scale = samples * view.focal * inverse
     return wp.vec3(
-        0.5 * float(view.width) + view.focal * wp.dot(offset, view.right) * inverse,
-        0.5 * float(view.height) - view.focal * wp.dot(offset, view.up) * inverse,
-        inverse,
+        0.5 * samples * float(view.width) + scale * at[0], 0.5 * samples * float(view.height) - scale * at[1], inverse
     )
 
 
-@wp.kernel
-def rasterise(
-    # in
+@wp.func
+def frame_of(view: View, samples: int, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Frame:
+    """Return the frame of a triangle whose corners are given along the camera's axes [m]."""
+    frame = Frame()
+    s = float(samples)
+    farthest = wp.max(a[2], wp.max(b[2], c[2]))
+    low = wp.vec2()
+    high = wp.vec2()
+    if is_shown(a) and is_shown(b) and is_shown(c) and farthest > NEAR:
+        if wp.min(a[2], wp.min(b[2], c[2])) >= NEAR:
+            frame.a = on_screen(view, s, a)
+            frame.b = on_screen(view, s, b)
+            frame.c = on_screen(view, s, c)
+            p = frame.a
+            q = frame.b
+            r = frame.c
+            # Twice the signed area; positive where the front shows (y points down).
+            if (r[0] - p[0]) * (q[1] - p[1]) - (q[0] - p[0]) * (r[1] - p[1]) > 0.0:
+                frame.kind = 1
+                low = wp.vec2(wp.min(p[0], wp.min(q[0], r[0])), wp.min(p[1], wp.min(q[1], r[1])))
+                high = wp.vec2(wp.max(p[0], wp.max(q[0], r[0])), wp.max(p[1], wp.max(q[1], r[1])))
+        elif wp.dot(wp.cross(b - a, c - a), a) > 0.0:
+            # The axes right, up and forward are left-handed, so a front has a positive product.
+            frame.kind = 2
+            low = wp.vec2(_FAR_OUT, _FAR_OUT)
+            high = wp.vec2(-_FAR_OUT, -_FAR_OUT)
+            for k in range(3):
+                p = wp.where(k == 0, a, wp.where(k == 1, b, c))
+                q = wp.where(k == 0, b, wp.where(k == 1, c, a))
+                if p[2] >= NEAR:
+                    seen = on_screen(view, s, p)
+                    low = wp.min(low, wp.vec2(seen[0], seen[1]))
+                    high = wp.max(high, wp.vec2(seen[0], seen[1]))
+                if (p[2] < NEAR) != (q[2] < NEAR):
+                    # where the edge crosses the near plane
+                    crossing = p + (q - p) * ((NEAR - p[2]) / (q[2] - p[2]))
+                    seen = on_screen(view, s, wp.vec3(crossing[0], crossing[1], NEAR))
+                    low = wp.min(low, wp.vec2(seen[0], seen[1]))
+                    high = wp.max(high, wp.vec2(seen[0], seen[1]))
+    if frame.kind > 0:
+        frame.left = wp.max(int(wp.ceil(wp.clamp(low[0], -1.0, _FAR_OUT) - 0.5)), 0)
+        frame.top = wp.max(int(wp.ceil(wp.clamp(low[1], -1.0, _FAR_OUT) - 0.5)), 0)
+        frame.right = wp.min(int(wp.floor(wp.clamp(high[0], -1.0, _FAR_OUT) - 0.5)), samples * view.width - 1)
+        frame.bottom = wp.min(int(wp.floor(wp.clamp(high[1], -1.0, _FAR_OUT) - 0.5)), samples * view.height - 1)
+        if frame.left > frame.right or frame.top > frame.bottom:
+            frame.kind = 0
+    return frame
+
+
+@wp.func
+def edge(p: wp.vec3, q: wp.vec3, x: float, y: float) -> float:
+    """Return twice the signed area between an edge and a sample; the edge from the other side gives its negative."""
+    return (q[0] - x) * (p[1] - y) - (p[0] - x) * (q[1] - y)
+
+
+@wp.func
+def keep_nearest(nearest: wp.array2d[wp.uint64], c: int, sample: int, inverse: float, triangle: int):
+    """Show a triangle at a sample if nothing nearer is there."""
+    key = (wp.uint64(wp.cast(inverse, wp.uint32)) << wp.uint64(32)) | wp.uint64(triangle + 1)
+    if key > nearest[c, sample]:
+        wp.atomic_max(nearest, c, sample, key)
+
+
+@wp.func
+def draw(
     view: View,
-    vertices: wp.array[wp.vec3],  # [m], (V,)
-    colors: wp.array[wp.vec3],  # sRGB in [0, 255], (V,)
-    corners: wp.array[wp.vec3i],  # (T,)
-    # in, out
-    nearest: wp.array2d[float],  # inverse depth [1/m], 0 where nothing is drawn
-    image: wp.array2d[wp.vec3],
+    samples: int,
+    frame: Frame,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    picture: int,
+    triangle: int,
+    row: int,
+    rows: int,
+    lane: int,
+    lanes: int,
+    nearest: wp.array2d[wp.uint64],
 ):
-    """Draw the triangles' fronts into the samples, the nearest winning."""
-    # One thread: triangles that overlap must not race for a sample, and a CPU launch has one core anyway.
-    for triangle in range(corners.shape[0]):
-        corner = corners[triangle]
-        a = project(view, vertices[corner[0]])
-        b = project(view, vertices[corner[1]])
-        c = project(view, vertices[corner[2]])
-        # Twice the signed area; positive where the front shows (y points down).
-        area = (c[0] - a[0]) * (b[1] - a[1]) - (b[0] - a[0]) * (c[1] - a[1])
-        if area > 1.0e-9 and wp.max(a[2], wp.max(b[2], c[2])) < 1.0 / _NEAR:
-            left = wp.max(int(wp.ceil(wp.min(a[0], wp.min(b[0], c[0])) - 0.5)), 0)
-            right = wp.min(int(wp.floor(wp.max(a[0], wp.max(b[0], c[0])) - 0.5)), view.width - 1)
-            top = wp.max(int(wp.ceil(wp.min(a[1], wp.min(b[1], c[1])) - 0.5)), 0)
-            bottom = wp.min(int(wp.floor(wp.max(a[1], wp.max(b[1], c[1])) - 0.5)), view.height - 1)
-            for y in range(top, bottom + 1):
-                for x in range(left, right + 1):
-                    px = float(x) + 0.5
-                    py = float(y) + 0.5
-                    wa = ((c[0] - px) * (b[1] - py) - (b[0] - px) * (c[1] - py)) / area
-                    wb = ((a[0] - px) * (c[1] - py) - (c[0] - px) * (a[1] - py)) / area
-                    wc = 1.0 - wa - wb
-                    if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
-                        inverse = wa * a[2] + wb * b[2] + wc * c[2]
-                        if inverse > nearest[y, x]:
-                            nearest[y, x] = inverse
-                            image[y, x] = wa * colors[corner[0]] + wb * colors[corner[1]] + wc * colors[corner[2]]
-
-
-@wp.func
-def ground_point(view: View, x: float, y: float) -> wp.vec3:
-    """Return ground coordinates seen at a sample [m] and their inverse depth [1/m]; 0 above the horizon."""
-    ray = (
-        view.forward
-        + ((x - 0.5 * float(view.width)) * view.right + (0.5 * float(view.height) - y) * view.up) / view.focal
-    )
-    depth = (_GROUND_HEIGHT - view.eye[2]) / wp.min(ray[2], -1.0e-6)
-    inverse = wp.where(ray[2] < -1.0e-5, 1.0 / depth, 0.0)
-    return wp.vec3(view.eye[0] + depth * ray[0], view.eye[1] + depth * ray[1], inverse)
-
-
-@wp.func
-def triangle_wave(x: float) -> float:
-    """Return the integral of the square wave of period 2, for a box filter."""
-    return 2.0 * wp.abs(0.5 * x - wp.floor(0.5 * x) - 0.5)
-
-
-@wp.func
-def lines_integral(x: float) -> float:
-    """Return the integral of the lines at whole numbers."""
-    return wp.floor(x) * _LINE_SHARE + wp.min(x - wp.floor(x), _LINE_SHARE)
-
-
-@wp.func
-def checker(look: GroundLook, at: wp.vec2, footprint: wp.vec2) -> wp.vec3:
-    """Return the ground's colour averaged over a pixel, ``at`` and ``footprint`` in squares."""
-    low = at - 0.5 * footprint
-    high = at + 0.5 * footprint
-    sx = (triangle_wave(low[0]) - triangle_wave(high[0])) / footprint[0]
-    sy = (triangle_wave(low[1]) - triangle_wave(high[1])) / footprint[1]
-    color = wp.lerp(look.light, look.dark, 0.5 - 0.5 * sx * sy)
-    lx = (lines_integral(high[0]) - lines_integral(low[0])) / footprint[0]
-    ly = (lines_integral(high[1]) - lines_integral(low[1])) / footprint[1]
-    return wp.lerp(color, look.line, lx + ly - lx * ly)
-
-
-@wp.func
-def shadow_at(look: GroundLook, opacity: wp.array2d[float], x: float, y: float) -> float:
-    """Return the opacity of the shadow at a point of the ground [m], between texels."""
-    size = opacity.shape[0]
-    scale = float(size) / look.shadow_size
-    u = (x - look.shadow_origin[0]) * scale - 0.5
-    v = (y - look.shadow_origin[1]) * scale - 0.5
-    result = float(0.0)
-    if u >= 0.0 and v >= 0.0 and u < float(size - 1) and v < float(size - 1):
-        i = int(u)
-        j = int(v)
-        fu = u - float(i)
-        fv = v - float(j)
-        result = (1.0 - fu) * ((1.0 - fv) * opacity[i, j] + fv * opacity[i, j + 1]) + fu * (
-            (1.0 - fv) * opacity[i + 1, j] + fv * opacity[i + 1, j + 1]
-        )
-    return result
-
-
-@wp.kernel
-def resolve(
-    # in
-    view: View,
-    look: GroundLook,
-    opacity: wp.array2d[float],
-    # in, out: cleared for the next picture
-    nearest: wp.array2d[float],
-    image: wp.array2d[wp.vec3],
-    # out
-    picture: wp.array3d[wp.uint8],  # (H, W, 3)
-):
-    """Average the samples of a pixel; where nothing was drawn, show the ground or the background."""
-    row, column = wp.tid()
-    x = float(column * SAMPLES) + 0.5 * float(SAMPLES)
-    y = float(row * SAMPLES) + 0.5 * float(SAMPLES)
-    back = wp.lerp(look.sky_top, look.sky_bottom, y / float(view.height))
-    here = ground_point(view, x, y)
-    if here[2] > 0.0:
-        distance = wp.length(wp.vec2(here[0], here[1]) - look.center)
-        share = wp.clamp((_FADE_END - distance) / (_FADE_END - _FADE_START), 0.0, 1.0)
-        if share > 0.0:
-            across = ground_point(view, x + float(SAMPLES), y)
-            along = ground_point(view, x, y + float(SAMPLES))
-            footprint = wp.vec2(
-                wp.abs(across[0] - here[0]) + wp.abs(along[0] - here[0]),
-                wp.abs(across[1] - here[1]) + wp.abs(along[1] - here[1]),
-            )
-            squares = wp.vec2(here[0], here[1]) / _SQUARE
-            color = checker(look, squares, footprint / _SQUARE)
-            back = wp.lerp(back, color, share * share * (3.0 - 2.0 * share))
-            back = wp.lerp(back, look.shadow, shadow_at(look, opacity, here[0], here[1]))
-    total = wp.vec3(0.0)
-    for i in range(SAMPLES):
-        for j in range(SAMPLES):
-            r = row * SAMPLES + i
-            c = column * SAMPLES + j
-            if nearest[r, c] > here[2]:
-                total += image[r, c]
+    """Draw every ``rows``-th row from ``row`` on, and in it every ``lanes``-th sample from ``lane`` on."""
+    width = samples * view.width
+    for y in range(frame.top + row, frame.bottom + 1, rows):
+        for x in range(frame.left + lane, frame.right + 1, lanes):
+            px = float(x) + 0.5
+            py = float(y) + 0.5
+            inverse = float(0.0)
+            if frame.kind == 1:
+                wa = edge(frame.b, frame.c, px, py)
+                wb = edge(frame.c, frame.a, px, py)
+                wc = edge(frame.a, frame.b, px, py)
+                if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
+                    total = wa + wb + wc
+                    if total > 0.0:
+                        inverse = (wa * frame.a[2] + wb * frame.b[2] + wc * frame.c[2]) / total
             else:
-                total += back
-            nearest[r, c] = 0.0
-    total = total / float(SAMPLES * SAMPLES)
-    for channel in range(3):
-        picture[row, column, channel] = wp.uint8(wp.clamp(total[channel] + 0.5, 0.0, 255.0))
+                s = 1.0 / (float(samples) * view.focal)
+                ray = wp.vec3((px - 0.5 * float(width)) * s, (0.5 * float(samples * view.height) - py) * s, 1.0)
+                ua = wp.dot(wp.cross(b, c), ray)
+                ub = wp.dot(wp.cross(c, a), ray)
+                uc = wp.dot(wp.cross(a, b), ray)
+                if ua >= 0.0 and ub >= 0.0 and uc >= 0.0:
+                    inverse = (ua + ub + uc) / wp.dot(wp.cross(b - a, c - a), a)
+            if inverse > 0.0 and inverse <= _MOST:
+                keep_nearest(nearest, picture, y * width + x, inverse, triangle)
+
+
+@wp.kernel
+def draw_triangles(
+    # in
+    first: int,
+    threads: int,
+    samples: int,
+    large: int,
+    views: wp.array[View],
+    triangles: wp.array[wp.vec3i],
+    vertices: wp.array2d[wp.vec3],  # [m], (N, V)
+    # in, out
+    nearest: wp.array2d[wp.uint64],  # keys of the samples, 0 where nothing is drawn, (C, samples)
+    num_large: wp.array[int],
+    # out
+    large_triangles: wp.array2d[int],
+):
+    """Draw the triangles' fronts; those of more than ``large`` samples are left for :func:`draw_large`."""
+    c, thread = wp.tid()
+    n = first + c
+    view = views[n]
+    for t in range(thread, triangles.shape[0], threads):
+        corner = triangles[t]
+        p = to_camera(view, vertices[n, corner[0]])
+        q = to_camera(view, vertices[n, corner[1]])
+        r = to_camera(view, vertices[n, corner[2]])
+        frame = frame_of(view, samples, p, q, r)
+        if frame.kind > 0:
+            slot = int(large_triangles.shape[1])
+            if (frame.right - frame.left + 1) > large // (frame.bottom - frame.top + 1):
+                slot = wp.atomic_add(num_large, c, 1)
+            if slot < large_triangles.shape[1]:
+                large_triangles[c, slot] = t
+            else:
+                draw(view, samples, frame, p, q, r, c, t, 0, 1, 0, 1, nearest)
+
+
+@wp.kernel
+def draw_large(
+    # in
+    first: int,
+    threads: int,
+    samples: int,
+    views: wp.array[View],
+    triangles: wp.array[wp.vec3i],
+    vertices: wp.array2d[wp.vec3],  # [m], (N, V)
+    num_large: wp.array[int],
+    large_triangles: wp.array2d[int],
+    # in, out
+    nearest: wp.array2d[wp.uint64],
+):
+    """Draw large triangles, all threads of a picture one after the other."""
+    c, thread = wp.tid()
+    n = first + c
+    view = views[n]
+    for k in range(wp.min(num_large[c], large_triangles.shape[1])):
+        t = large_triangles[c, k]
+        corner = triangles[t]
+        p = to_camera(view, vertices[n, corner[0]])
+        q = to_camera(view, vertices[n, corner[1]])
+        r = to_camera(view, vertices[n, corner[2]])
+        frame = frame_of(view, samples, p, q, r)
+        draw(view, samples, frame, p, q, r, c, t, thread // _LANES, threads // _LANES, thread % _LANES, _LANES, nearest)
+
+
+class Raster:
+    """Samples of a chunk of pictures, and the launches that fill them.
+
+    Attributes:
+        nearest: keys of the samples, row by row, 0 where nothing is drawn, shape ``(C, samples)``. Whatever reads the
+            keys sets them back to zero for the next run.
+        num_large: large triangles of each picture, shape ``(C,)``; set back likewise.
+    """
+
+    def __init__(self, surfaces: Surfaces, pictures: int, pixels: int, samples: int, device: wp.Device) -> None:
+        """Allocate the samples.
+
+        Args:
+            surfaces: that are drawn.
+            pictures: number of pictures ``C`` at a time.
+            pixels: of a picture.
+            samples: along each side of a pixel.
+            device: of the surfaces.
+        """
+        self._surfaces, self._samples, self._shares = surfaces, samples, wp.get_device(device).is_cuda
+        self.nearest = wp.zeros((pictures, pixels * samples**2), dtype=wp.uint64, device=device)
+        self.num_large = wp.zeros(pictures, dtype=int, device=device)
+        self._large = wp.zeros((pictures, _MOST_LARGE if self._shares else 1), dtype=int, device=device)
+
+    def record(
+        self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, views: wp.array, threads: Threads
+    ) -> None:
+        """Append the launches that draw a chunk.
+
+        Args:
+            graph: to append to.
+            first: picture of the chunk's first row.
+            count: pictures of the chunk.
+            vertices: of all pictures [m], shape ``(N, V)``.
+            views: of all pictures, shape ``(N,)``.
+            threads: returns the number of threads a picture.
+        """
+        triangles = self._surfaces.triangles
+        k = threads(len(triangles))
+        large = _LARGE if self._shares else (1 << 31) - 1
+        graph.launch(
+            draw_triangles,
+            (count, k),
+            [first, k, self._samples, large, views, triangles, vertices],
+            [self.nearest, self.num_large, self._large],
+        )
+        if self._shares:
+            k = -(-threads(1 << 14) // 32) * 32
+            graph.launch(
+                draw_large,
+                (count, k),
+                [first, k, self._samples, views, triangles, vertices, self.num_large, self._large],
+                [self.nearest],
+            )

@@ -1,4 +1,4 @@
-"""Pictures of bodies and markers: the one entry point of this package."""
+"""Pictures of bodies and markers that are given as arrays: one picture at a time."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ from collections.abc import Sequence
 from types import TracebackType
 
 import numpy as np
+import warp as wp
 
-from piavatar_envs.render import coloring, shading, vtk_backend
-from piavatar_envs.render.backend import Backend, Shot
-from piavatar_envs.render.display import claim_opengl, opengl_available, owns_opengl
-from piavatar_envs.render.geometry import Topology, drawable, topology_key
-from piavatar_envs.render.ground import ground_shadow
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render.coloring import color_by, srgb_to_linear
 from piavatar_envs.render.overlay import draw_scale
+from piavatar_envs.render.painter import GREATEST_SIDE, Painter
 from piavatar_envs.render.scene import Body, Camera, Follower, Marker
+from piavatar_envs.render.surfaces import MeshPart, Surfaces, linear_albedo
+from piavatar_envs.render.views import Shot, view_rows
 
-BACKENDS = ("auto", "pyvista", "software")
+#: Least side of a picture [px].
+_LEAST_SIDE = 16
 
 
 class Renderer:
-    """Draws off screen into arrays.
+    """Draws pictures into arrays, in any thread and in any process, without a graphics driver.
 
     Example::
 
@@ -28,33 +30,29 @@ class Renderer:
     """
 
     def __init__(
-        self, width: int = 480, height: int = 480, camera: Camera | None = None, backend: str = "auto"
+        self, width: int = 480, height: int = 480, camera: Camera | None = None, device: str | wp.Device = "cpu"
     ) -> None:
-        """Open the window.
+        """Prepare pictures of one size; nothing is allocated before the first.
 
         Args:
             width: of the picture [px].
             height: of the picture [px].
             camera: the view; by default of a standing person, three-quarters from the front.
-            backend: ``"pyvista"`` (OpenGL), ``"software"`` (no graphics driver needed; the CPU) or ``"auto"``: the
-                first where OpenGL works off screen, else the second. They draw the same. OpenGL is for the main
-                thread, and not for processes that were forked after the first window was opened: a renderer that is
-                used there goes on by software.
+            device: Warp device to draw on. A GPU is for the process that first used it.
 
         Raises:
-            ImportError: pyvista is not installed.
-            ValueError: a size outside [16, 8192], or an unknown back end.
-            RuntimeError: ``backend="pyvista"`` where there is no OpenGL, or where it may not be used.
+            ValueError: a size outside [16, 8192].
         """
         for name, value in (("width", width), ("height", height)):
-            if not 16 <= value <= 8192:
-                raise ValueError(f"{name}={value} px is outside [16, 8192]")
+            if not _LEAST_SIDE <= value <= GREATEST_SIDE:
+                raise ValueError(f"{name}={value} px is outside [{_LEAST_SIDE}, {GREATEST_SIDE}]")
         self.width, self.height = int(width), int(height)
         self.camera = camera or Camera()
+        self._device = device
         self._follower = Follower(self.camera)
-        self._topology: Topology | None = None
         self._corner = 0  # of the colour scale
-        self._backend: Backend | None = _open(backend, self.width, self.height)
+        self._shown: _Shown | None = None
+        self._closed = False
 
     def render(
         self,
@@ -66,7 +64,7 @@ class Renderer:
         """Draw one picture.
 
         Args:
-            bodies: meshes in world coordinates.
+            bodies: meshes in world coordinates; triangles with a corner that is not finite are left out.
             markers: spheres, arrows, boxes, capsules and rings.
             follow: the point the camera follows [m], shape ``(3,)``, for example the root; the origin if None.
             elapsed: time since the last picture [s], in which the camera has glided.
@@ -75,22 +73,33 @@ class Renderer:
             The picture, shape ``(height, width, 3)`` uint8; the caller's own.
 
         Raises:
+            ImportError: a body has scalars, whose scale has text, and Pillow is not installed (extra ``render``).
             RuntimeError: the renderer is closed.
             ValueError: nothing to show, or a body's arrays do not fit together.
         """
-        if self._backend is None:
+        if self._closed:
             raise RuntimeError("this Renderer is closed; make a new one")
-        if isinstance(self._backend, vtk_backend.VtkBackend) and not owns_opengl():
-            _elsewhere.append(self._backend)
-            self._backend = _open("software", self.width, self.height)
+        if not bodies and not markers:
+            raise ValueError("nothing to show: give at least one body or marker")
         center = self._follower.move(follow, elapsed)
-        topology, vertices, colors = self._gather(bodies, markers)
         offset = np.array([*center, 0.0])
         shot = Shot(offset + self.camera.position, offset + self.camera.target, self.camera.field_of_view, center)
-        columns = np.ascontiguousarray(vertices.T)
-        casters = shading.Casters(*topology.triangles(columns))
-        light = shading.shade(topology, columns, colors.T, shot.eye, casters)
-        picture = self._backend.draw(topology, vertices, coloring.to_bytes(light.T), ground_shadow(casters), shot)
+        meshes = [(body.vertices, body.faces) for body in bodies] + [marker.mesh() for marker in markers]
+        vertices = np.concatenate([np.asarray(mesh[0], dtype=np.float32) for mesh in meshes])
+        albedo = np.concatenate(
+            [_body_albedo(body) for body in bodies]
+            + [
+                np.broadcast_to(linear_albedo(marker.color), (len(mesh[0]), 3))
+                for marker, mesh in zip(markers, meshes[len(bodies) :], strict=True)
+            ]
+        )
+        key = tuple((id(faces), len(own)) for own, faces in meshes)
+        if self._shown is None or self._shown.key != key:
+            faces = tuple(mesh[1] for mesh in meshes)
+            parts = [MeshPart(len(own), faces) for own, faces in meshes]
+            painter = Painter(Surfaces.build(parts, self._device), 1, self.height, self.width, self._device)
+            self._shown = _Shown(key, faces, painter)
+        picture = self._shown.draw(vertices, albedo, shot)
         for body in bodies:
             if body.scalars is not None:
                 of_bodies = vertices[: sum(len(body.vertices) for body in bodies)]
@@ -104,12 +113,8 @@ class Renderer:
         self._follower.cut()
 
     def close(self) -> None:
-        """Free the window; closing twice is fine."""
-        if isinstance(self._backend, vtk_backend.VtkBackend) and not owns_opengl():
-            _elsewhere.append(self._backend)
-        elif self._backend is not None:
-            self._backend.close()
-        self._backend = None
+        """Free the memory; closing twice is fine."""
+        self._shown, self._closed = None, True
 
     def __enter__(self) -> Renderer:
         return self
@@ -119,59 +124,42 @@ class Renderer:
     ) -> None:
         self.close()
 
-    def _gather(self, bodies: Sequence[Body], markers: Sequence[Marker]) -> tuple[Topology, np.ndarray, np.ndarray]:
-        """Join all bodies and markers to one mesh: triangles, vertices ``(V, 3)`` [m] and own colours ``(V, 3)``."""
-        if not bodies and not markers:
-            raise ValueError("nothing to show: give at least one body or marker")
-        meshes = [(body.vertices, body.faces) for body in bodies] + [marker.mesh() for marker in markers]
-        colors = [_body_colors(body) for body in bodies]
-        colors += [
-            np.broadcast_to(marker.color, (len(mesh[0]), 3))
-            for marker, mesh in zip(markers, meshes[len(bodies) :], strict=True)
-        ]
-        faces, counts = [mesh[1] for mesh in meshes], [len(mesh[0]) for mesh in meshes]
-        if self._topology is None or self._topology.key != topology_key(faces, counts):
-            self._topology = Topology(faces, counts)
-        vertices = drawable(np.concatenate([np.asarray(mesh[0], dtype=np.float32) for mesh in meshes]))
-        return self._topology, vertices, np.concatenate(colors)
+
+class _Shown:
+    """Painter of meshes that are shown again and again, and its launches.
+
+    The launches are made one by one, because a captured graph would exclude other threads while it is captured.
+    """
+
+    def __init__(self, key: tuple, faces: tuple[np.ndarray, ...], painter: Painter) -> None:
+        self.key, self._painter = key, painter
+        self._faces = faces  # an id is only unique while its owner lives
+        graph = LaunchGraph(painter.device)
+        painter.record(graph)
+        self._launches = [launch for _, launch in graph.launches]
+
+    def draw(self, vertices: np.ndarray, albedo: np.ndarray, shot: Shot) -> np.ndarray:
+        """Draw the meshes with these vertices ``(V, 3)`` [m] and linear colours ``(V, 3)``; returns a copy."""
+        painter = self._painter
+        painter.vertices.assign(vertices[None])
+        painter.surfaces.albedo.assign(albedo[None])
+        painter.views.assign(view_rows([shot], painter.height, painter.width))
+        painter.centers.assign(np.asarray(shot.center, np.float32)[None])
+        with wp.ScopedDevice(painter.device):
+            for launch in self._launches:
+                launch()
+        return painter.picture.numpy()[0].copy()
 
 
-#: Windows of other threads and processes, kept because only these may close them.
-_elsewhere: list[Backend] = []
-
-
-def _open(backend: str, width: int, height: int) -> Backend:
-    if backend not in BACKENDS:
-        raise ValueError(f"unknown backend {backend!r}; use one of {', '.join(BACKENDS)}")
-    # Also without OpenGL, so that a missing extra shows on every machine alike.
-    vtk_backend.import_pyvista()
-    if backend == "pyvista" and not owns_opengl():
-        raise RuntimeError(
-            "backend='pyvista' is for the main thread, and not for a process that was forked after the first picture; "
-            "use backend='software', or start processes by the method 'spawn'"
-        )
-    if backend != "software" and owns_opengl() and opengl_available():
-        claim_opengl()
-        return vtk_backend.VtkBackend(width, height)
-    if backend == "pyvista":
-        raise RuntimeError(
-            "backend='pyvista' needs OpenGL, and no EGL driver was found; install one (Debian, Ubuntu: libegl1) or "
-            "use backend='software'"
-        )
-    from piavatar_envs.render.software_backend import SoftwareBackend
-
-    return SoftwareBackend(width, height)
-
-
-def _body_colors(body: Body) -> np.ndarray:
-    if body.scalars is None and body.colors is not None:
-        if np.shape(body.colors) != (len(body.vertices), 3):
-            raise ValueError(f"colors have shape {np.shape(body.colors)}; give a row a vertex: {len(body.vertices)}")
-        return body.colors / np.float32(255.0)
-    if body.scalars is None:
-        return np.broadcast_to(body.color, (len(body.vertices), 3))
-    if np.shape(body.scalars) != (len(body.vertices),):
-        raise ValueError(
-            f"scalars have shape {np.shape(body.scalars)}; give one value a vertex, shape ({len(body.vertices)},)"
-        )
-    return coloring.color_by(body.scalars, body.scalar_max)
+def _body_albedo(body: Body) -> np.ndarray:
+    """Return the linear light that the vertices of a body reflect, shape ``(V, 3)``."""
+    count = len(body.vertices)
+    if body.scalars is not None:
+        if np.shape(body.scalars) != (count,):
+            raise ValueError(
+                f"scalars have shape {np.shape(body.scalars)}; give one value a vertex, shape ({count},)"
+            )
+        return srgb_to_linear(color_by(body.scalars, body.scalar_max)).astype(np.float32)
+    if body.colors is not None and np.shape(body.colors) != (count, 3):
+        raise ValueError(f"colors have shape {np.shape(body.colors)}; give a row a vertex: {count}")
+    return np.broadcast_to(linear_albedo(body.color if body.colors is None else body.colors), (count, 3))

@@ -1,131 +1,258 @@
-"""Light on the vertices: a warm key light with soft shadows, sky and ground light, a rim (NumPy).
+"""Light on the vertices: a warm key light with soft shadows, sky and ground light, a rim and gloss.
 
-The skin has a vertex about every centimetre, close to a pixel of a small picture, so the light is worked out there
-and not by the graphics driver: soft shadows become affordable on a CPU, and every machine draws the same colours.
-Arrays of points are ``(3, N)`` float32.
+The skin has a vertex about every centimetre, close to a pixel of a small picture, so the light is found there and
+interpolated: soft shadows become affordable on a CPU, and every machine draws the same colours.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warp as wp
 
-import numpy as np
-from scipy import ndimage
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render.shadows import (
+    AREA_SCALE,
+    DEPTH_SCALE,
+    KEY,
+    MAP_TEXEL,
+    MAP_X,
+    MAP_Y,
+    Grids,
+    Shadows,
+    Threads,
+    is_near,
+)
+from piavatar_envs.render.surfaces import Surfaces
+from piavatar_envs.render.views import View
 
-from piavatar_envs.render.coloring import srgb_to_linear
-from piavatar_envs.render.geometry import Topology, length, unit
+wp.set_module_options({"enable_backward": False})
 
-#: Direction to the key light: from the avatar's right front, high.
-KEY = unit(np.array([-0.42, -0.72, 0.95], dtype=np.float32))
-_KEY_LIGHT = np.array([1.12, 1.06, 0.985], dtype=np.float32)
-_SKY_LIGHT = np.array([0.43, 0.455, 0.50], dtype=np.float32)
-_GROUND_LIGHT = np.array([0.27, 0.245, 0.225], dtype=np.float32)
-_RIM_LIGHT = np.array([0.34, 0.38, 0.44], dtype=np.float32)
+_KEY_LIGHT = wp.constant(wp.vec3(1.12, 1.06, 0.985))
+_SKY_LIGHT = wp.constant(wp.vec3(0.43, 0.455, 0.50))
+_GROUND_LIGHT = wp.constant(wp.vec3(0.27, 0.245, 0.225))
+_RIM_LIGHT = wp.constant(wp.vec3(0.34, 0.38, 0.44))
 #: Light bleeds around the terminator, red furthest, as in skin.
-_WRAP = np.array([0.30, 0.19, 0.14], dtype=np.float32)
+_WRAP = wp.constant(wp.vec3(0.30, 0.19, 0.14))
 _SHININESS = 5  # as a power of two: cheaper by squaring
-_SPECULAR = 0.09
-
-_MAP_TEXEL = 0.014
-_MAP_LIMIT = 320
-_MAP_MARGIN = 4
-_SHADOW_BIAS = 0.03
-_SHADOW_SOFTNESS = 0.03
-_TAPS = np.array([[0, 0], [1, 1], [-1, 1], [1, -1], [-1, -1], [2, 0], [-2, 0], [0, 2], [0, -2]], dtype=np.float32)
-
-_VOXEL = 0.035
-_VOXEL_LIMIT = 96
-_REACHES = (1.6, 3.0)
-_FLAT_OCCLUSION = 0.22
-
-
-@dataclass(frozen=True, eq=False)
-class Casters:
-    """Points that stand for all surfaces shown [m] and their outward area vectors [m^2], both ``(3, N)``."""
-
-    points: np.ndarray
-    areas: np.ndarray
-
-
-def shade(
-    topology: Topology, positions: np.ndarray, colors: np.ndarray, eye: np.ndarray, casters: Casters
-) -> np.ndarray:
-    """Light leaving the vertices towards the eye.
-
-    Args:
-        topology: how the vertices are joined.
-        positions: vertices [m], shape ``(3, V)``.
-        colors: their own colours, sRGB in [0, 1], shape ``(3, V)``.
-        eye: the camera's position [m], shape ``(3,)``.
-        casters: the triangles, which throw shadows.
-
-    Returns:
-        Linear light, not negative, shape ``(3, V)``.
-    """
-    normals = unit(topology.vertex_areas(casters.areas))
-    view = unit(np.asarray(eye, dtype=np.float32)[:, None] - positions)
-    shares = np.stack([_lit_share(positions, casters), 1.0 - _occlusion(positions, normals, casters)], axis=1)
-    # Smoothing along the skin hides the cells that both were found in.
-    lit, open_sky = np.ascontiguousarray(topology.smooth(shares, passes=3).T)
-    facing = KEY @ normals
-    up = 0.5 + 0.5 * normals[2]
-    grazing = 1.0 - np.clip((normals * view).sum(axis=0), 0.0, 1.0)
-    rim = grazing**3 * (0.35 + 0.65 * up) * open_sky
-    gloss = np.maximum((normals * unit(view + KEY[:, None])).sum(axis=0), 0.0)
-    for _ in range(_SHININESS):
-        gloss = gloss * gloss
-    gloss *= _SPECULAR * lit * (0.4 + grazing)
-    albedo = srgb_to_linear(colors)
-    light = np.empty_like(positions)
-    for channel in range(3):
-        wrap = _WRAP[channel]
-        key = np.maximum((facing + wrap) / (1.0 + wrap), 0.0) * _KEY_LIGHT[channel]
-        # The wrapped light passes a shadow's edge too: keep a little of its red.
-        key *= lit + (1.0 - lit) * (0.25 * wrap)
-        ambient = (_GROUND_LIGHT[channel] + (_SKY_LIGHT[channel] - _GROUND_LIGHT[channel]) * up) * open_sky
-        light[channel] = albedo[channel] * (key + ambient + _RIM_LIGHT[channel] * rim) + gloss
-    return light
-
-
-def _lit_share(positions: np.ndarray, casters: Casters) -> np.ndarray:
-    """Return the share of the key light that reaches each vertex, shape ``(V,)``: a shadow map seen from the light."""
-    side = unit(np.cross(KEY, [0.0, 0.0, 1.0])).astype(np.float32)
-    frame = np.stack([side, np.cross(KEY, side), KEY])
-    points = frame @ casters.points
-    low = points[:2].min(axis=1)
-    extent = points[:2].max(axis=1) - low
-    texel = np.float32(max(_MAP_TEXEL, float(extent.max()) / (_MAP_LIMIT - 2 * _MAP_MARGIN)))
-    rows, columns = (np.ceil(extent / texel).astype(int) + 2 * _MAP_MARGIN).tolist()
-    cell = ((points[:2] - low[:, None]) / texel).astype(np.int32) + _MAP_MARGIN
-    depth = np.full(rows * columns, -np.inf, dtype=np.float32)
-    np.maximum.at(depth, cell[0] * columns + cell[1], points[2])
-    depth = ndimage.maximum_filter(depth.reshape(rows, columns), size=3).ravel()
-    own = frame @ positions
-    at = (own[:2] - low[:, None]) / texel + np.float32(_MAP_MARGIN)
-    hidden = np.zeros(positions.shape[1], dtype=np.float32)
-    threshold = own[2] + np.float32(_SHADOW_BIAS)
-    for tap in _TAPS * np.float32(_MAP_TEXEL / texel):
-        row = np.clip((at[0] + tap[0]).astype(np.int32), 0, rows - 1)
-        column = np.clip((at[1] + tap[1]).astype(np.int32), 0, columns - 1)
-        hidden += np.clip((depth[row * columns + column] - threshold) / np.float32(_SHADOW_SOFTNESS), 0.0, 1.0)
-    return 1.0 - hidden / np.float32(len(_TAPS))
-
-
-def _occlusion(positions: np.ndarray, normals: np.ndarray, casters: Casters) -> np.ndarray:
-    """Return the share of the sky hidden by near surfaces, ``(V,)``: surface in blurred voxels along the normal."""
-    low = casters.points.min(axis=1) - np.float32(3.0 * _VOXEL)
-    extent = casters.points.max(axis=1) - low
-    voxel = np.float32(max(_VOXEL, float(extent.max()) / (_VOXEL_LIMIT - 4)))
-    shape = tuple((np.ceil(extent / voxel).astype(int) + 4).tolist())
-    x, y, z = ((casters.points - low[:, None]) / voxel).astype(np.int32)
-    area = np.bincount((x * shape[1] + y) * shape[2] + z, weights=length(casters.areas), minlength=int(np.prod(shape)))
-    filled = (area / voxel**2).astype(np.float32).reshape(shape)
-    for _ in range(2):
-        filled = ndimage.uniform_filter(filled, 3, mode="constant")
-    at = (positions - low[:, None]) / voxel - np.float32(0.5)
-    hidden = sum(
-        ndimage.map_coordinates(filled, at + np.float32(reach) * normals, order=1, mode="constant")
-        for reach in _REACHES
+_SPECULAR = wp.constant(0.09)
+#: Distance behind another surface at which a shadow begins, and over which it becomes full [m].
+_SHADOW_BIAS, _SHADOW_SOFTNESS = wp.constant(0.03), wp.constant(0.03)
+#: Places of the map around a vertex whose shadows are averaged, in least texels.
+_TAPS = wp.constant(
+    wp.types.matrix(shape=(9, 2), dtype=float)(
+        0.0, 0.0, 1.0, 1.0, -1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 2.0, 0.0, -2.0, 0.0, 0.0, 2.0, 0.0, -2.0
     )
-    # A flat surface sees some of itself in the blur: what is above that is occlusion.
-    return np.clip(1.1 * (hidden - np.float32(_FLAT_OCCLUSION)), 0.0, 0.75)
+)
+_NUM_TAPS = wp.constant(9)
+#: Distances along the normal at which surfaces hide the sky, in voxels.
+_NEAR_REACH, _FAR_REACH = wp.constant(1.6), wp.constant(3.0)
+#: A flat surface sees some of itself in the blur: only what is above that hides the sky.
+_FLAT_OCCLUSION = wp.constant(0.22)
+#: Averages with the neighbours, which hide the cells of the grids.
+_SMOOTHINGS = 3
+
+
+@wp.func
+def lit_share(own: Grids, depth: wp.array2d[int], c: int, at: wp.vec3) -> float:
+    """Return the share of the key light that reaches a point [m]."""
+    place = wp.vec2(wp.dot(MAP_X, at), wp.dot(MAP_Y, at)) - own.map_origin
+    threshold = wp.dot(KEY, at) + _SHADOW_BIAS
+    hidden = float(0.0)
+    for k in range(_NUM_TAPS):
+        row = wp.clamp(int((place[0] + MAP_TEXEL * _TAPS[k, 0]) / own.map_texel), 0, own.map_rows - 1)
+        column = wp.clamp(int((place[1] + MAP_TEXEL * _TAPS[k, 1]) / own.map_texel), 0, own.map_columns - 1)
+        nearest = float(depth[c, row * own.map_columns + column]) / DEPTH_SCALE
+        hidden += wp.clamp((nearest - threshold) / _SHADOW_SOFTNESS, 0.0, 1.0)
+    return 1.0 - hidden / float(_NUM_TAPS)
+
+
+@wp.func
+def filled_at(own: Grids, filled: wp.array2d[int], c: int, at: wp.vec3) -> float:
+    """Return the surface in the voxels around a point [m], over a voxel's side squared; trilinear, 0 outside."""
+    place = (at - own.voxel_origin) / own.voxel - wp.vec3(0.5)
+    x = int(wp.floor(place[0]))
+    y = int(wp.floor(place[1]))
+    z = int(wp.floor(place[2]))
+    total = float(0.0)
+    if x >= 0 and y >= 0 and z >= 0 and x + 1 < own.voxels_x and y + 1 < own.voxels_y and z + 1 < own.voxels_z:
+        u = place[0] - float(x)
+        v = place[1] - float(y)
+        w = place[2] - float(z)
+        cell = (x * own.voxels_y + y) * own.voxels_z + z
+        for i in range(2):
+            for j in range(2):
+                base = cell + (i * own.voxels_y + j) * own.voxels_z
+                column = (1.0 - w) * float(filled[c, base]) + w * float(filled[c, base + 1])
+                total += wp.where(i == 1, u, 1.0 - u) * wp.where(j == 1, v, 1.0 - v) * column
+    return total * AREA_SCALE
+
+
+@wp.func
+def occlusion(own: Grids, filled: wp.array2d[int], c: int, at: wp.vec3, normal: wp.vec3) -> float:
+    """Return the share of the sky that near surfaces hide from a point [m]."""
+    hidden = filled_at(own, filled, c, at + _NEAR_REACH * own.voxel * normal)
+    hidden += filled_at(own, filled, c, at + _FAR_REACH * own.voxel * normal)
+    return wp.clamp(1.1 * (hidden - _FLAT_OCCLUSION), 0.0, 0.75)
+
+
+@wp.kernel
+def find_light(
+    # in
+    first: int,
+    num_vertices: int,
+    threads: int,
+    offsets: wp.array[int],  # of the triangles of every vertex, (V + 1,)
+    incident: wp.array[int],
+    vertices: wp.array2d[wp.vec3],  # [m], (N, V)
+    areas: wp.array2d[wp.vec3],  # of the triangles [m^2], (C, T)
+    grids: wp.array[Grids],
+    depth: wp.array2d[int],
+    filled: wp.array2d[int],
+    # out
+    normals: wp.array2d[wp.vec3],  # (C, V)
+    shares: wp.array2d[wp.vec2],  # of the key light and of the sky that reach the vertex
+):
+    """Find the normals of the vertices, and the light that reaches them."""
+    c, thread = wp.tid()
+    own = grids[c]
+    for i in range(thread, num_vertices, threads):
+        total = wp.vec3()
+        for k in range(offsets[i], offsets[i + 1]):
+            total += areas[c, incident[k]]
+        normal = wp.normalize(total)
+        at = vertices[first + c, i]
+        share = wp.vec2(1.0, 1.0)
+        if is_near(at):
+            share = wp.vec2(lit_share(own, depth, c, at), 1.0 - occlusion(own, filled, c, at, normal))
+        normals[c, i] = normal
+        shares[c, i] = share
+
+
+@wp.func
+def smoothed(offsets: wp.array[int], neighbours: wp.array[int], shares: wp.array2d[wp.vec2], c: int, i: int) -> wp.vec2:
+    """Return the mean of a vertex and its neighbours."""
+    begin = offsets[i]
+    end = offsets[i + 1]
+    total = shares[c, i]
+    for k in range(begin, end):
+        total += shares[c, neighbours[k]]
+    return total / float(end - begin + 1)
+
+
+@wp.kernel
+def smooth_light(
+    # in
+    num_vertices: int,
+    threads: int,
+    offsets: wp.array[int],  # of the neighbours of every vertex, (V + 1,)
+    neighbours: wp.array[int],
+    shares: wp.array2d[wp.vec2],  # (C, V)
+    # out
+    shares_out: wp.array2d[wp.vec2],
+):
+    """Average the light with that of the neighbours."""
+    c, thread = wp.tid()
+    for i in range(thread, num_vertices, threads):
+        shares_out[c, i] = smoothed(offsets, neighbours, shares, c, i)
+
+
+@wp.kernel
+def send_light(
+    # in
+    first: int,
+    num_vertices: int,
+    threads: int,
+    offsets: wp.array[int],  # of the neighbours of every vertex, (V + 1,)
+    neighbours: wp.array[int],
+    views: wp.array[View],
+    vertices: wp.array2d[wp.vec3],  # [m], (N, V)
+    normals: wp.array2d[wp.vec3],  # (C, V)
+    shares: wp.array2d[wp.vec2],
+    # out
+    light: wp.array2d[wp.vec4],  # (C, V)
+):
+    """Find the light that leaves the vertices towards the eye: a factor of their albedo, and the gloss beside it."""
+    c, thread = wp.tid()
+    eye = views[first + c].eye
+    for i in range(thread, num_vertices, threads):
+        share = smoothed(offsets, neighbours, shares, c, i)
+        lit = share[0]
+        sky = share[1]
+        normal = normals[c, i]
+        toward = wp.normalize(eye - vertices[first + c, i])
+        facing = wp.dot(KEY, normal)
+        up = 0.5 + 0.5 * normal[2]
+        grazing = 1.0 - wp.clamp(wp.dot(normal, toward), 0.0, 1.0)
+        rim = grazing * grazing * grazing * (0.35 + 0.65 * up) * sky
+        gloss = wp.max(wp.dot(normal, wp.normalize(toward + KEY)), 0.0)
+        for _ in range(wp.static(_SHININESS)):
+            gloss = gloss * gloss
+        gloss = gloss * _SPECULAR * lit * (0.4 + grazing)
+        result = wp.vec4(0.0, 0.0, 0.0, gloss)
+        for channel in range(3):
+            wrap = _WRAP[channel]
+            key = wp.max((facing + wrap) / (1.0 + wrap), 0.0) * _KEY_LIGHT[channel]
+            # The wrapped light passes a shadow's edge too: keep a little of its red.
+            key = key * (lit + (1.0 - lit) * (0.25 * wrap))
+            ambient = (_GROUND_LIGHT[channel] + (_SKY_LIGHT[channel] - _GROUND_LIGHT[channel]) * up) * sky
+            result[channel] = key + ambient + _RIM_LIGHT[channel] * rim
+        light[c, i] = result
+
+
+class Lighting:
+    """Light on the vertices of a chunk of pictures, and the launches that find it.
+
+    Attributes:
+        light: factor of each vertex's albedo (three channels) and gloss, linear, shape ``(C, V)``.
+    """
+
+    def __init__(self, surfaces: Surfaces, pictures: int, device: wp.Device) -> None:
+        """Allocate the light.
+
+        Args:
+            surfaces: that are lit.
+            pictures: number of pictures ``C`` at a time.
+            device: of the surfaces.
+        """
+        shape = (pictures, max(1, surfaces.num_vertices))
+        self._surfaces = surfaces
+        self._normals = wp.zeros(shape, dtype=wp.vec3, device=device)
+        self._shares = [wp.zeros(shape, dtype=wp.vec2, device=device) for _ in range(2)]
+        self.light = wp.zeros(shape, dtype=wp.vec4, device=device)
+
+    def record(
+        self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, views: wp.array, shadows: Shadows,
+        threads: Threads,
+    ) -> None:  # fmt: skip
+        """Append the launches that light a chunk.
+
+        Args:
+            graph: to append to.
+            first: picture of the chunk's first row.
+            count: pictures of the chunk.
+            vertices: of all pictures [m], shape ``(N, V)``.
+            views: of all pictures, shape ``(N,)``.
+            shadows: of the chunk, recorded before.
+            threads: returns the number of threads a picture.
+        """
+        surfaces = self._surfaces
+        k = threads(surfaces.num_vertices)
+        near, other = self._shares
+        graph.launch(
+            find_light,
+            (count, k),
+            [
+                first, surfaces.num_vertices, k, surfaces.incident_offsets, surfaces.incident, vertices, shadows.areas,
+                shadows.grids, shadows.depth, shadows.filled,
+            ],
+            [self._normals, near],
+        )  # fmt: skip
+        around = [surfaces.neighbour_offsets, surfaces.neighbours]
+        for _ in range(_SMOOTHINGS - 1):
+            graph.launch(smooth_light, (count, k), [surfaces.num_vertices, k, *around, near], [other])
+            near, other = other, near
+        graph.launch(
+            send_light,
+            (count, k),
+            [first, surfaces.num_vertices, k, *around, views, vertices, self._normals, near],
+            [self.light],
+        )

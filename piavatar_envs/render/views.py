@@ -1,14 +1,42 @@
-"""Interface of the two back ends: a shot in, a picture out."""
+"""Cameras of pictures: a shot on the host, and the view of it that kernels read."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
+import warp as wp
 
-from piavatar_envs.render.geometry import Topology
-from piavatar_envs.render.ground import GroundShadow
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class View:
+    """A perspective camera: the eye [m], its axes (right, up, forward; unit), focal length [px], picture size [px]."""
+
+    eye: wp.vec3
+    right: wp.vec3
+    up: wp.vec3
+    forward: wp.vec3
+    focal: float
+    width: int
+    height: int
+
+
+@wp.func
+def to_camera(view: View, point: wp.vec3) -> wp.vec3:
+    """Return a world point [m] along the camera's axes: to its right, up and into the picture."""
+    offset = point - view.eye
+    return wp.vec3(wp.dot(offset, view.right), wp.dot(offset, view.up), wp.dot(offset, view.forward))
+
+
+@wp.func
+def ray_of(view: View, x: float, y: float) -> wp.vec3:
+    """Return the ray through a pixel position, x to the right and y down [px]; its depth along the axis is one."""
+    right = (x - 0.5 * float(view.width)) / view.focal
+    up = (0.5 * float(view.height) - y) / view.focal
+    return view.forward + right * view.right + up * view.up
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,26 +85,17 @@ class Shot:
         return np.stack([0.5 * width + scale * (relative @ right), 0.5 * height - scale * (relative @ up)], axis=1)
 
 
-class Backend(Protocol):
-    """Turns lit vertices into pictures of one size."""
+def view_rows(shots: Sequence[Shot], height: int, width: int) -> np.ndarray:
+    """Return the views of shots as a structured array ``(N,)``, to assign to a ``wp.array`` of :class:`View`.
 
-    def draw(
-        self, topology: Topology, vertices: np.ndarray, colors: np.ndarray, shadow: GroundShadow, shot: Shot
-    ) -> np.ndarray:
-        """Draw one picture.
-
-        Args:
-            topology: the triangles; a new object where they changed.
-            vertices: positions [m], shape ``(V, 3)`` float32.
-            colors: lit sRGB colours, shape ``(V, 3)`` uint8.
-            shadow: the shadow on the ground.
-            shot: where the picture is taken from.
-
-        Returns:
-            The picture, shape ``(height, width, 3)`` uint8, a copy.
-        """
-        ...
-
-    def close(self) -> None:
-        """Free the window and the buffers."""
-        ...
+    Args:
+        shots: the cameras.
+        height: of the pictures [px].
+        width: of the pictures [px].
+    """
+    rows = np.zeros(len(shots), dtype=View.numpy_dtype())
+    for row, shot in zip(rows, shots, strict=True):
+        row["forward"], row["right"], row["up"] = shot.axes
+        row["eye"], row["focal"] = shot.eye, shot.focal(height)
+        row["width"], row["height"] = width, height
+    return rows

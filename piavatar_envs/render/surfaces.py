@@ -1,0 +1,199 @@
+"""Surfaces that pictures show: triangles, colours and textures, which stay while the vertices move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.render.coloring import srgb_to_linear
+from piavatar_envs.render.scene import CLAY, Color
+
+#: Largest side of a texture on the device [texels]; larger images are reduced.
+MOST_TEXELS = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """One mesh among those that are drawn together.
+
+    Attributes:
+        num_vertices: number of its vertices ``V``.
+        faces: outward oriented triangles, shape ``(T, 3)`` int; only their fronts are drawn.
+        color: sRGB in [0, 1] of all of it.
+        colors: sRGB of the vertices instead, shape ``(V, 3)`` uint8.
+        texture: sRGB image of the base colour instead, shape ``(h, w, 3)`` uint8.
+        uv: place of the vertices in the image, from its upper left corner (0, 0) to its lower right (1, 1), repeated
+            beyond, shape ``(V, 2)``; needed with a texture.
+        subject: label of its pixels in a segmentation, from 1 to 255; 0 is the ground and the sky.
+    """
+
+    num_vertices: int
+    faces: np.ndarray
+    color: Color = CLAY
+    colors: np.ndarray | None = None
+    texture: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    subject: int = 1
+
+    def __post_init__(self) -> None:
+        shape = (self.num_vertices, 3)
+        if self.colors is not None and np.shape(self.colors) != shape:
+            raise ValueError(f"colors have shape {np.shape(self.colors)}; give a row a vertex: {self.num_vertices}")
+        if self.texture is not None and np.shape(self.uv) != (self.num_vertices, 2):
+            raise ValueError(f"a texture needs uv of shape {(self.num_vertices, 2)}; got {np.shape(self.uv)}")
+        if not 0 <= self.subject <= 255:
+            raise ValueError(f"subject={self.subject} is outside [0, 255]: a label is one byte")
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Meshes laid one after the other, on a device.
+
+    A vertex that is not finite hides its triangles, so that one topology serves pictures that show less than all.
+
+    Attributes:
+        num_vertices: of all meshes, ``V``.
+        triangles: corners, shape ``(T,)``.
+        incident_offsets: first entry of each vertex in :attr:`incident`, shape ``(V + 1,)``.
+        incident: triangles of every vertex, ascending.
+        neighbour_offsets: first entry of each vertex in :attr:`neighbours`, shape ``(V + 1,)``.
+        neighbours: vertices that share an edge with every vertex, ascending.
+        albedo: linear light in [0, 1] that each vertex reflects, shape ``(1, V)``, or ``(N, V)`` with a row a picture;
+            may be rewritten at any time.
+        uv: place of each vertex in its texture, shape ``(V,)``.
+        texture: texture of each triangle, -1 without one, shape ``(T,)``.
+        texels: textures with all their reduced levels, from the full size to one texel, sRGB, shape ``(K, n, 3)``.
+        texture_size: side of the textures [texels], a power of two.
+        subject: label of each triangle, shape ``(T,)``.
+    """
+
+    num_vertices: int
+    triangles: wp.array
+    incident_offsets: wp.array
+    incident: wp.array
+    neighbour_offsets: wp.array
+    neighbours: wp.array
+    albedo: wp.array
+    uv: wp.array
+    texture: wp.array
+    texels: wp.array
+    texture_size: int
+    subject: wp.array
+
+    @classmethod
+    def build(cls, meshes: Sequence[MeshPart], device: str | wp.Device, num_albedos: int = 1) -> Surfaces:
+        """Join meshes on a device.
+
+        Args:
+            meshes: their vertices follow one another in this order.
+            device: of the pictures.
+            num_albedos: rows of :attr:`albedo`: one for all pictures, or one for each.
+
+        Raises:
+            ValueError: a triangle has a corner outside its mesh.
+        """
+        counts = [mesh.num_vertices for mesh in meshes]
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        faces = []
+        for mesh, offset in zip(meshes, first, strict=False):
+            own = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
+            if len(own) and not (own.min() >= 0 and own.max() < mesh.num_vertices):
+                raise ValueError(f"faces have corners up to {own.max()}, and the mesh has {mesh.num_vertices} vertices")
+            faces.append(own + offset)
+        triangles = np.concatenate(faces) if faces else np.zeros((0, 3), np.int64)
+        images = [mesh.texture for mesh in meshes if mesh.texture is not None]
+        size = _side(images)
+        labels, textures, found = [], [], 0
+        for mesh, own in zip(meshes, faces, strict=True):
+            labels.append(np.full(len(own), mesh.subject))
+            textures.append(np.full(len(own), found if mesh.texture is not None else -1))
+            found += mesh.texture is not None
+        uv = [np.zeros((mesh.num_vertices, 2)) if mesh.uv is None else np.asarray(mesh.uv) for mesh in meshes]
+        albedo = [
+            np.broadcast_to(linear_albedo(mesh.color if mesh.colors is None else mesh.colors), (mesh.num_vertices, 3))
+            for mesh in meshes
+        ]
+        incident = _incident(triangles, int(first[-1]))
+        neighbours = _neighbours(triangles, int(first[-1]))
+        texels = np.stack([_levels(_resized(image, size)) for image in images] or [np.zeros((1, 3), np.uint8)])
+
+        def upload(values: np.ndarray, dtype: type) -> wp.array:
+            # Kernels take no empty arrays.
+            values = values if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        return cls(
+            num_vertices=int(first[-1]),
+            triangles=wp.array(triangles.astype(np.int32), dtype=wp.vec3i, device=device),
+            incident_offsets=upload(incident[0], wp.int32),
+            incident=upload(incident[1], wp.int32),
+            neighbour_offsets=upload(neighbours[0], wp.int32),
+            neighbours=upload(neighbours[1], wp.int32),
+            albedo=wp.array(np.tile(np.concatenate(albedo), (num_albedos, 1, 1)), dtype=wp.vec3, device=device),
+            uv=upload(np.concatenate(uv or [np.zeros((0, 2))]).astype(np.float32), wp.vec2),
+            texture=upload(np.concatenate(textures or [np.zeros(0)]).astype(np.int32), wp.int32),
+            texels=upload(texels, wp.uint8),
+            texture_size=size,
+            subject=upload(np.concatenate(labels or [np.zeros(0)]).astype(np.int32), wp.int32),
+        )
+
+
+def linear_albedo(color: Color | np.ndarray) -> np.ndarray:
+    """Return linear light in [0, 1], float32, of a colour (sRGB in [0, 1]) or of colours ``(V, 3)`` uint8."""
+    if isinstance(color, np.ndarray) and color.dtype == np.uint8:
+        return _LINEAR[color]
+    return srgb_to_linear(color).astype(np.float32)
+
+
+#: Linear light of every sRGB byte.
+_LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
+
+
+def _incident(triangles: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return offsets and triangles of every vertex, ascending."""
+    corners = triangles.ravel()
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=num_vertices))])
+    return offsets.astype(np.int32), (np.argsort(corners, kind="stable") // 3).astype(np.int32)
+
+
+def _neighbours(triangles: np.ndarray, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return offsets and neighbours of every vertex, ascending."""
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    edges = np.unique(np.concatenate([start * num_vertices + end, end * num_vertices + start]))
+    owner, other = np.divmod(edges, max(num_vertices, 1))
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=num_vertices))])
+    return offsets.astype(np.int32), other.astype(np.int32)
+
+
+def _side(images: Sequence[np.ndarray]) -> int:
+    """Return the side of the textures on the device: a power of two that holds the largest image, within the limit."""
+    largest = max((max(image.shape[:2]) for image in images), default=1)
+    return min(MOST_TEXELS, 1 << int(np.ceil(np.log2(max(largest, 1)))))
+
+
+def _resized(image: np.ndarray, size: int) -> np.ndarray:
+    """Return an image at ``size`` by ``size`` texels, averaged where it shrinks, shape ``(size, size, 3)`` float."""
+    values = np.asarray(image, dtype=np.float32)
+    for axis in (0, 1):
+        length = values.shape[axis]
+        # The integral of the image between the edges of the new texels, over their width.
+        total = np.concatenate([np.zeros_like(values.take([0], axis)), np.cumsum(values, axis, np.float64)], axis)
+        edges = np.linspace(0.0, length, size + 1)
+        low = np.minimum(edges.astype(int), length - 1)
+        share = (edges - low).reshape([-1 if axis == each else 1 for each in range(3)])
+        at_edges = total.take(low, axis) * (1.0 - share) + total.take(low + 1, axis) * share
+        values = (np.diff(at_edges, axis=axis) * (size / length)).astype(np.float32)
+    return values
+
+
+def _levels(image: np.ndarray) -> np.ndarray:
+    """Return a square image and its halves down to one texel, one after the other, shape ``(n, 3)`` uint8."""
+    levels = [image]
+    while len(levels[-1]) > 1:
+        side = len(levels[-1]) // 2
+        levels.append(levels[-1].reshape(side, 2, side, 2, 3).mean(axis=(1, 3)))
+    flat = np.concatenate([level.reshape(-1, 3) for level in levels])
+    return np.clip(np.rint(flat), 0, 255).astype(np.uint8)
