@@ -23,6 +23,7 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS
 from piavatar_envs.avatar.gltf import Gltf, read_gltf
 from piavatar_envs.avatar.motion.library import load_motion
 from piavatar_envs.config.schema import PhysicsConfig
+from piavatar_envs.core.extras import missing
 from piavatar_envs.core.writing import check_writable
 
 #: Endings of files of glTF, which may hold a character, motions or both.
@@ -109,10 +110,11 @@ def draw(asset: AvatarAsset, path: Path) -> None:
     """
     from piavatar_envs.render.renderer import Renderer
     from piavatar_envs.render.scene import Body, Camera, Capsule, Sphere
-    from piavatar_envs.render.vtk_backend import import_pyvista
 
-    import_pyvista()
-    from PIL import Image
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise missing("a picture of a file", "PIL", "render") from error
 
     body = asset.mean_body()
     shift = body.vertices[0].astype(np.float64) - asset.vertices[0]

@@ -215,7 +215,6 @@ def test_play_prints_the_return(probe, capsys):
 @pytest.mark.parametrize("name", ["Reach-v0", "PIAvatar/Stand-v0"])
 def test_an_environment_is_played_and_filmed(name, device, tmp_path):
     imageio = pytest.importorskip("imageio.v3")
-    pytest.importorskip("pyvista")
     cli.check_id(name)
     settings = {"fidelity": "tiny", "width": 96, "height": 96}
     rollout = play.play(name, "random", tmp_path / "a.mp4", 2, 0, device, "strain", settings)

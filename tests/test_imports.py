@@ -161,7 +161,7 @@ def test_a_circle_is_found(tmp_path):
 
 def test_importing_is_light_and_an_environment_imports_no_renderer():
     """Check that an import leaves Warp uninitialized: a forked worker inherits a CUDA context that it cannot use."""
-    unused = ("torch", "pyvista", "vtk", "matplotlib", "imageio", "viser")
+    unused = ("torch", "PIL", "matplotlib", "imageio", "viser")
     heavy = (*unused, "stable_baselines3", "pettingzoo", "pybullet_data")
     code = f"""
 import sys

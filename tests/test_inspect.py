@@ -67,7 +67,6 @@ def test_a_report_names_joints_size_and_what_is_worn(knight, capsys):
 
 
 def test_a_picture_shows_the_body_and_its_skeleton(knight, tmp_path):
-    pytest.importorskip("pyvista", reason="needs the extra render")
     image = pytest.importorskip("PIL.Image")
     inspection.examine(knight, picture=tmp_path / "knight.png")
     picture = np.asarray(image.open(tmp_path / "knight.png")).astype(float)

@@ -100,7 +100,7 @@ class EpisodeHost:
             ImportError: ``array_api="torch"`` without torch, or a render mode without its extra: ``render``, ``live``.
             ValueError: no environments or threads, an unknown device or kind of arrays.
         """
-        check_extra(render_mode)
+        check_extra(render_mode, task.config.render.color)
         check_count("num_envs", num_envs)
         if num_threads is not None:
             check_count("num_threads", num_threads, ", or None for one a core")
@@ -520,7 +520,7 @@ class EpisodeHost:
         With ``"human"`` resets and steps update the live view.
 
         Raises:
-            ImportError: the extra ``render`` is not installed.
+            ImportError: pictures have text, and Pillow is not installed (extra ``render``).
             gymnasium.error.ResetNeeded: before the first reset.
         """
         if self.render_mode is None:
@@ -762,7 +762,7 @@ class SingleView(HostView):
         With ``"human"`` resets and steps update the live view.
 
         Raises:
-            ImportError: the extra ``render`` is not installed.
+            ImportError: pictures have text, and Pillow is not installed (extra ``render``).
             gymnasium.error.ResetNeeded: before the first reset.
         """
         frames = self.host.render()

@@ -33,8 +33,6 @@ RENDER_MODES = ("rgb_array", "human")
 BATCH_RENDER_MODES = ("rgb_array",)
 #: Height of the bodies that tasks place their cameras for, at most [m].
 SHOWN_HEIGHT = 1.8
-#: Modules that pictures need.
-_DRAWING = ("pyvista", "PIL")
 #: Least time between two scenes sent to a browser [s]: no screen shows more.
 _LEAST_INTERVAL = 1.0 / 60.0
 
@@ -51,14 +49,14 @@ def check_render_mode(render_mode: str | None, modes: tuple[str, ...] = RENDER_M
     return render_mode
 
 
-def check_extra(render_mode: str | None) -> None:
-    """Refuse pictures without the extra that draws them, before anything is built; nothing heavy is imported.
+def check_extra(render_mode: str | None, color: str) -> None:
+    """Refuse pictures whose text cannot be drawn, before anything is built; nothing heavy is imported.
 
     Raises:
-        ImportError: ``render_mode="rgb_array"`` without the extra ``render``.
+        ImportError: ``render_mode="rgb_array"`` with a colour scale, and without Pillow (extra ``render``).
     """
-    if render_mode == "rgb_array" and (lacking := [name for name in _DRAWING if find_spec(name) is None]):
-        raise missing(f"render_mode={render_mode!r}", lacking[0], "render")
+    if render_mode == "rgb_array" and color != "skin" and find_spec("PIL") is None:
+        raise missing(f"the scale of color={color!r}", "PIL", "render")
 
 
 def check_batch_render_mode(render_mode: str | None) -> str | None:
@@ -204,11 +202,7 @@ class Picture:
     """Draws environments of a batch with one renderer."""
 
     def __init__(self, batch: BatchEnv, config: RenderConfig) -> None:
-        """Open the renderer.
-
-        Raises:
-            ImportError: the extra ``render`` is not installed.
-        """
+        """Open the renderer."""
         from piavatar_envs.render import Renderer
 
         self.config = config
@@ -247,7 +241,7 @@ class Pictures:
         """Draw the scene of environment ``env``, ``(height, width, 3)`` uint8.
 
         Raises:
-            ImportError: the extra ``render`` is not installed.
+            ImportError: pictures have text, and Pillow is not installed (extra ``render``).
         """
         batch, own = self._place(env)
         if env not in self._opened:

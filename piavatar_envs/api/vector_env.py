@@ -422,7 +422,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         """Draw every environment, ``(height, width, 3)`` uint8, with ``render_mode="rgb_array"``; else return None.
 
         Raises:
-            ImportError: the extra ``render`` is not installed.
+            ImportError: pictures have text, and Pillow is not installed (extra ``render``).
             gymnasium.error.ResetNeeded: before the first reset.
         """
         return self.host.render()

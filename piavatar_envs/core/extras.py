@@ -8,7 +8,7 @@ from pathlib import Path
 
 #: Modules by extra; an extra is present if all of its modules are.
 EXTRAS = {
-    "render": ("pyvista", "imageio", "imageio_ffmpeg", "PIL"),
+    "render": ("imageio", "imageio_ffmpeg", "PIL"),
     "train": ("stable_baselines3", "torch", "matplotlib", "tensorboard"),
     "motions": ("pybullet_data",),
     "props": ("trimesh",),

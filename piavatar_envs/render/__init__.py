@@ -1,4 +1,4 @@
-"""Pictures and videos (extra ``render``). Importing this needs no graphics library; building a Renderer does."""
+"""Pictures and videos. Pictures need no library but Warp; text on them and videos need the extra ``render``."""
 
 from piavatar_envs.render.coloring import strain_magnitude
 from piavatar_envs.render.overlay import label, side_by_side

@@ -69,10 +69,15 @@ def color_by(values: ArrayLike, maximum: float) -> np.ndarray:
     Raises:
         ValueError: the maximum is not positive.
     """
+    return strain_table()[strain_color(values, maximum)]
+
+
+def strain_color(values: ArrayLike, maximum: float) -> np.ndarray:
+    """Return the rows of :func:`strain_table` that :func:`color_by` shows for scalars, shape ``(N,)``."""
     if not maximum > 0.0:
         raise ValueError(f"maximum={maximum} must be positive: it is the value of the last colour")
     position = np.nan_to_num(np.asarray(values, dtype=np.float64) / maximum, nan=1.0)
-    return strain_table()[np.rint(np.clip(position, 0.0, 1.0) * (_TABLE_SIZE - 1)).astype(np.int64)]
+    return np.rint(np.clip(position, 0.0, 1.0) * (_TABLE_SIZE - 1)).astype(np.int64)
 
 
 def srgb_to_linear(color: ArrayLike) -> np.ndarray:
@@ -85,17 +90,6 @@ def linear_to_srgb(light: ArrayLike) -> np.ndarray:
     """Convert light intensities to sRGB in [0, 1], clipped (IEC 61966-2-1)."""
     light = np.clip(np.asarray(light, dtype=np.float64), 0.0, 1.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-
-
-def to_bytes(light: np.ndarray) -> np.ndarray:
-    """Convert light intensities to bytes (sRGB) by a table, quick enough for every vertex of every frame."""
-    table = _byte_table()
-    return table[np.clip(light * np.float32(len(table) - 1), 0.0, len(table) - 1).astype(np.int32)]
-
-
-@lru_cache(maxsize=1)
-def _byte_table() -> np.ndarray:
-    return np.rint(255.0 * linear_to_srgb(np.linspace(0.0, 1.0, 1 << 14))).astype(np.uint8)
 
 
 def oklab_to_srgb(lab: ArrayLike) -> np.ndarray:

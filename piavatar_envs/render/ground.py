@@ -12,11 +12,11 @@ from piavatar_envs.render.views import View, ray_of
 wp.set_module_options({"enable_backward": False})
 
 #: Side of a checker square [m], and the share of it that the line between two squares takes.
-_SQUARE, _LINE_SHARE = wp.constant(0.5), wp.constant(2.0 / 256.0)
+SQUARE, _LINE_SHARE = wp.constant(0.5), wp.constant(2.0 / 256.0)
 #: Just below z = 0 [m], so that soles on it stay visible.
-_HEIGHT = wp.constant(-0.004)
+HEIGHT = wp.constant(-0.004)
 #: Distances from the picture's centre at which the ground begins to fade, and has faded [m].
-_FADE_START, _FADE_END = wp.constant(1.6), wp.constant(7.5)
+_FADE_START, FADE_END = wp.constant(1.6), wp.constant(7.5)
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Ground:
 
 @wp.func
 def ground_at(view: View, x: float, y: float) -> wp.vec3:
-    """Return the ground's coordinates seen at a pixel position [m] and their inverse depth [1/m]; 0 above the horizon."""
+    """Return the ground seen at a pixel position: x, y [m] and the inverse depth [1/m], 0 above the horizon."""
     ray = ray_of(view, x, y)
-    depth = (_HEIGHT - view.eye[2]) / wp.min(ray[2], -1.0e-6)
+    depth = (HEIGHT - view.eye[2]) / wp.min(ray[2], -1.0e-6)
     inverse = wp.where(ray[2] < -1.0e-5 and depth > 0.0, 1.0 / depth, 0.0)
     return wp.vec3(view.eye[0] + depth * ray[0], view.eye[1] + depth * ray[1], inverse)
 
@@ -65,7 +65,7 @@ def ground_at(view: View, x: float, y: float) -> wp.vec3:
 def ground_share(at: wp.vec3, center: wp.vec2) -> float:
     """Return the opacity of the ground at a point of :func:`ground_at`."""
     distance = wp.length(wp.vec2(at[0], at[1]) - center)
-    share = wp.clamp((_FADE_END - distance) / (_FADE_END - _FADE_START), 0.0, 1.0)
+    share = wp.clamp((FADE_END - distance) / (FADE_END - _FADE_START), 0.0, 1.0)
     return wp.where(at[2] > 0.0, share * share * (3.0 - 2.0 * share), 0.0)
 
 
@@ -86,10 +86,10 @@ def checker(ground: Ground, view: View, at: wp.vec3, x: float, y: float) -> wp.v
     """Return the ground's colour averaged over the pixel at ``(x, y)``, which shows the point ``at``."""
     across = ground_at(view, x + 1.0, y)
     along = ground_at(view, x, y + 1.0)
-    width = wp.max((wp.abs(across[0] - at[0]) + wp.abs(along[0] - at[0])) / _SQUARE, 1.0e-6)
-    height = wp.max((wp.abs(across[1] - at[1]) + wp.abs(along[1] - at[1])) / _SQUARE, 1.0e-6)
-    left = at[0] / _SQUARE - 0.5 * width
-    low = at[1] / _SQUARE - 0.5 * height
+    width = wp.max((wp.abs(across[0] - at[0]) + wp.abs(along[0] - at[0])) / SQUARE, 1.0e-6)
+    height = wp.max((wp.abs(across[1] - at[1]) + wp.abs(along[1] - at[1])) / SQUARE, 1.0e-6)
+    left = at[0] / SQUARE - 0.5 * width
+    low = at[1] / SQUARE - 0.5 * height
     sx = (triangle_wave(left) - triangle_wave(left + width)) / width
     sy = (triangle_wave(low) - triangle_wave(low + height)) / height
     color = wp.lerp(ground.light, ground.dark, 0.5 - 0.5 * sx * sy)

@@ -18,7 +18,6 @@ import numpy as np
 from piavatar_envs.core.extras import missing
 from piavatar_envs.render import ground
 from piavatar_envs.render.coloring import bands_of, strain_table
-from piavatar_envs.render.geometry import drawable
 from piavatar_envs.render.scene import Camera, Color, Follower, Scene
 from piavatar_envs.render.shading import KEY
 
@@ -34,6 +33,9 @@ _WORLD = "/world"
 #: Names of the meshes of a scene's bodies, with the index of the body.
 _BODY = re.compile(rf"{_WORLD}/body_(\d+)")
 _GROUND_SIZE = 40.0
+_STYLE = ground.GroundStyle()
+#: Farther than this from the origin nothing is drawn [m].
+_FAR = 50.0
 #: A warm sun, a cool sky and what the ground gives back, as in the pictures; bytes.
 _KEY_LIGHT, _SKY_LIGHT, _GROUND_LIGHT = (255, 243, 226), (216, 228, 250), (206, 186, 170)
 
@@ -120,14 +122,18 @@ class LiveView:
         scene, first = self.server.scene, self.server.initial_camera
         first.position, first.look_at, first.fov = camera.position, camera.target, math.radians(camera.field_of_view)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
-        top, bottom = np.array(ground.BACKGROUND_TOP), np.array(ground.BACKGROUND_BOTTOM)
+        top, bottom = np.array(_STYLE.sky_top), np.array(_STYLE.sky_bottom)
         share = np.linspace(0.0, 1.0, 256)[:, None, None]
         sky = np.rint(255.0 * (top + share * (bottom - top))).astype(np.uint8)
         scene.set_background_image(np.repeat(sky, 16, axis=1), format="png")
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
         scene.add_light_directional(
-            "/light/key", color=_KEY_LIGHT, intensity=2.5, cast_shadow=True, position=tuple(10.0 * KEY)
+            "/light/key",
+            color=_KEY_LIGHT,
+            intensity=2.5,
+            cast_shadow=True,
+            position=tuple(10.0 * value for value in KEY),
         )
         scene.add_light_hemisphere(
             "/light/sky", sky_color=_SKY_LIGHT, ground_color=_GROUND_LIGHT, intensity=1.5, position=(0.0, 0.0, 1.0)
@@ -135,7 +141,7 @@ class LiveView:
         self._world = scene.add_frame(_WORLD, show_axes=False)
         self._ground = scene.add_grid(
             "/ground", _GROUND_SIZE, _GROUND_SIZE, cell_size=ground.SQUARE, section_size=2.0 * ground.SQUARE,
-            cell_color=_bytes(ground.LINE), section_color=_bytes(ground.LINE), plane_color=_bytes(ground.LIGHT_SQUARE),
+            cell_color=_bytes(_STYLE.line), section_color=_bytes(_STYLE.line), plane_color=_bytes(_STYLE.light),
             plane_opacity=1.0, shadow_opacity=0.3, fade_distance=2.0 * ground.FADE_END, fade_from="origin",
             position=(0.0, 0.0, ground.HEIGHT),
         )  # fmt: skip
@@ -161,7 +167,7 @@ class LiveView:
             for name in self._nodes.keys() - shown.keys():
                 self._nodes.pop(name).remove()
             for name, (vertices, faces, color) in shown.items():
-                self._place(name, drawable(vertices), faces, _bytes(color))
+                self._place(name, _drawable(vertices), faces, _bytes(color))
         strained = [body for body in scene.bodies if body.scalars is not None]
         if strained:
             self._scale.label = f"{strained[0].scalar_label}, 0 to {strained[0].scalar_max:g}"
@@ -254,3 +260,9 @@ def _silence() -> Iterator[None]:
     """Drop the library's output within a block, because ``verbose=False`` leaves some of it."""
     with contextlib.redirect_stdout(_Muted(sys.stdout)):
         yield
+
+
+def _drawable(vertices: np.ndarray) -> np.ndarray:
+    """Return vertices as float32 that a browser accepts, also of a failed simulation."""
+    vertices = np.asarray(vertices, dtype=np.float32)
+    return np.clip(np.nan_to_num(vertices, nan=0.0, posinf=_FAR, neginf=-_FAR), -_FAR, _FAR)

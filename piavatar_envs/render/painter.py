@@ -44,9 +44,9 @@ class Painter:
         views: cameras, shape ``(N,)``; input.
         centers: points of the ground about which it fades [m], shape ``(N,)``; input.
         picture: sRGB bytes, shape ``(N, height, width, 3)``.
-        depth: along the camera's axis of the nearest surface in each pixel, of the ground where that is seen, infinite in
-            the sky [m], shape ``(N, height, width)``; None unless asked for.
-        labels: subject of that surface, 0 for ground and sky, shape ``(N, height, width)`` uint8; None unless asked for.
+        depth: along the camera's axis, of the nearest surface in each pixel or of the ground, infinite in the sky [m],
+            shape ``(N, height, width)``; None unless asked for.
+        labels: subject of that surface, 0 for ground and sky, shape ``(N, height, width)`` uint8; None likewise.
         color: sRGB in [0, 1] of each pixel, shape ``(N, height, width)``, which the layers draw over.
         nearest: inverse depth of each pixel [1/m], 0 in the sky, shape ``(N, height, width)``.
         layers: drawn over the surfaces, in this order; append before :meth:`record`.
@@ -120,22 +120,29 @@ class Painter:
             self._record_chunk(graph, first, min(self.chunk, self.num_pictures - first))
         for layer in self.layers:
             layer.record(graph, self)
-        graph.launch(to_bytes, self.color.shape, [self.color, self.nearest], [self.picture, self._depth])
+        k = self._threads(self.height * self.width)
+        graph.launch(
+            to_bytes,
+            (self.num_pictures, k),
+            [k, _flat(self.color), _flat(self.nearest)],
+            [_flat(self.picture), _flat(self._depth)],
+        )
 
     def _record_chunk(self, graph: LaunchGraph, first: int, count: int) -> None:
         shadows, lighting, raster, surfaces = self._shadows, self._lighting, self._raster, self.surfaces
         vertices, views = self.vertices, self.views
         shadows.record(graph, first, count, vertices, self._threads)
         lighting.record(graph, first, count, vertices, views, shadows, self._threads)
-        raster.record(graph, first, count, vertices, views, self._threads)
+        raster.record(graph, first, count, vertices, views, shadows.areas, self._threads)
+        k = self._threads(self.height * self.width)
         graph.launch(
             resolve,
-            (count, self.height, self.width),
+            (count, k),
             [
-                first, self._samples, self._ground, self._paint, views, self.centers, surfaces.triangles, vertices,
+                first, k, self._samples, self._ground, self._paint, views, self.centers, surfaces.triangles, vertices,
                 lighting.light, shadows.grids, shadows.opacity, raster.nearest, raster.num_large,
             ],
-            [self.color, self.nearest, self._labels],
+            [_flat(self.color), _flat(self.nearest), _flat(self._labels)],
         )  # fmt: skip
 
     def _threads(self, items: int) -> int:
@@ -148,7 +155,9 @@ class Painter:
         """Return the number of pictures whose workspaces fit the memory that is set aside for them."""
         surfaces = self.surfaces
         samples = 8 * self.height * self.width * self._samples**2
-        return max(1, _WORKSPACE // (samples + Shadows.BYTES + 44 * surfaces.num_vertices + 12 * len(surfaces.triangles)))
+        return max(
+            1, _WORKSPACE // (samples + Shadows.BYTES + 44 * surfaces.num_vertices + 12 * len(surfaces.triangles))
+        )
 
     def _given(self, array: wp.array | None, name: str, shape: tuple[int, ...], dtype: type) -> wp.array:
         """Return an array that was given, or a new one."""
@@ -157,3 +166,8 @@ class Painter:
         if array.shape != shape:
             raise ValueError(f"{name} have shape {array.shape}; give {shape}")
         return array
+
+
+def _flat(array: wp.array) -> wp.array:
+    """Return an array of pictures with the pixels of each in one row."""
+    return array.reshape((array.shape[0], -1)) if array.size else wp.zeros((0, 0), array.dtype, array.device)

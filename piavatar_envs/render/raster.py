@@ -13,7 +13,7 @@ import warp as wp
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render.shadows import Threads, is_shown
 from piavatar_envs.render.surfaces import Surfaces
-from piavatar_envs.render.views import View, ray_of, to_camera
+from piavatar_envs.render.views import View, to_camera
 
 # Fused products would be rounded differently from the two sides of an edge.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -171,6 +171,7 @@ def draw_triangles(
     views: wp.array[View],
     triangles: wp.array[wp.vec3i],
     vertices: wp.array2d[wp.vec3],  # [m], (N, V)
+    areas: wp.array2d[wp.vec3],  # outward normals times area, zero where hidden, (C, T)
     # in, out
     nearest: wp.array2d[wp.uint64],  # keys of the samples, 0 where nothing is drawn, (C, samples)
     num_large: wp.array[int],
@@ -183,10 +184,16 @@ def draw_triangles(
     view = views[n]
     for t in range(thread, triangles.shape[0], threads):
         corner = triangles[t]
-        p = to_camera(view, vertices[n, corner[0]])
-        q = to_camera(view, vertices[n, corner[1]])
-        r = to_camera(view, vertices[n, corner[2]])
-        frame = frame_of(view, samples, p, q, r)
+        a = vertices[n, corner[0]]
+        frame = Frame()
+        p = wp.vec3()
+        q = wp.vec3()
+        r = wp.vec3()
+        if wp.dot(areas[c, t], view.eye - a) > 0.0:
+            p = to_camera(view, a)
+            q = to_camera(view, vertices[n, corner[1]])
+            r = to_camera(view, vertices[n, corner[2]])
+            frame = frame_of(view, samples, p, q, r)
         if frame.kind > 0:
             slot = int(large_triangles.shape[1])
             if (frame.right - frame.left + 1) > large // (frame.bottom - frame.top + 1):
@@ -250,8 +257,9 @@ class Raster:
         self._large = wp.zeros((pictures, _MOST_LARGE if self._shares else 1), dtype=int, device=device)
 
     def record(
-        self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, views: wp.array, threads: Threads
-    ) -> None:
+        self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, views: wp.array, areas: wp.array,
+        threads: Threads,
+    ) -> None:  # fmt: skip
         """Append the launches that draw a chunk.
 
         Args:
@@ -260,6 +268,7 @@ class Raster:
             count: pictures of the chunk.
             vertices: of all pictures [m], shape ``(N, V)``.
             views: of all pictures, shape ``(N,)``.
+            areas: outward normals times area of the chunk's triangles, zero where hidden, shape ``(C, T)``.
             threads: returns the number of threads a picture.
         """
         triangles = self._surfaces.triangles
@@ -268,7 +277,7 @@ class Raster:
         graph.launch(
             draw_triangles,
             (count, k),
-            [first, k, self._samples, large, views, triangles, vertices],
+            [first, k, self._samples, large, views, triangles, vertices, areas],
             [self.nearest, self.num_large, self._large],
         )
         if self._shares:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from types import TracebackType
 
 import numpy as np
 import warp as wp
 
+from piavatar_envs.core.capture_lock import CAPTURE
+from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.render.coloring import color_by, srgb_to_linear
+from piavatar_envs.render.coloring import srgb_to_linear, strain_color, strain_table
 from piavatar_envs.render.overlay import draw_scale
 from piavatar_envs.render.painter import GREATEST_SIDE, Painter
 from piavatar_envs.render.scene import Body, Camera, Follower, Marker
@@ -46,6 +49,7 @@ class Renderer:
         for name, value in (("width", width), ("height", height)):
             if not _LEAST_SIDE <= value <= GREATEST_SIDE:
                 raise ValueError(f"{name}={value} px is outside [{_LEAST_SIDE}, {GREATEST_SIDE}]")
+        init_warp()
         self.width, self.height = int(width), int(height)
         self.camera = camera or Camera()
         self._device = device
@@ -97,9 +101,11 @@ class Renderer:
         if self._shown is None or self._shown.key != key:
             faces = tuple(mesh[1] for mesh in meshes)
             parts = [MeshPart(len(own), faces) for own, faces in meshes]
-            painter = Painter(Surfaces.build(parts, self._device), 1, self.height, self.width, self._device)
-            self._shown = _Shown(key, faces, painter)
-        picture = self._shown.draw(vertices, albedo, shot)
+            with CAPTURE.exclusive():
+                painter = Painter(Surfaces.build(parts, self._device), 1, self.height, self.width, self._device)
+                self._shown = _Shown(key, faces, painter)
+        with CAPTURE.shared():
+            picture = self._shown.draw(vertices, albedo, shot)
         for body in bodies:
             if body.scalars is not None:
                 of_bodies = vertices[: sum(len(body.vertices) for body in bodies)]
@@ -156,10 +162,13 @@ def _body_albedo(body: Body) -> np.ndarray:
     count = len(body.vertices)
     if body.scalars is not None:
         if np.shape(body.scalars) != (count,):
-            raise ValueError(
-                f"scalars have shape {np.shape(body.scalars)}; give one value a vertex, shape ({count},)"
-            )
-        return srgb_to_linear(color_by(body.scalars, body.scalar_max)).astype(np.float32)
+            raise ValueError(f"scalars have shape {np.shape(body.scalars)}; give one value a vertex, shape ({count},)")
+        return _linear_strain_table()[strain_color(body.scalars, body.scalar_max)]
     if body.colors is not None and np.shape(body.colors) != (count, 3):
         raise ValueError(f"colors have shape {np.shape(body.colors)}; give a row a vertex: {count}")
     return np.broadcast_to(linear_albedo(body.color if body.colors is None else body.colors), (count, 3))
+
+
+@lru_cache(maxsize=1)
+def _linear_strain_table() -> np.ndarray:
+    return srgb_to_linear(strain_table()).astype(np.float32)

@@ -40,9 +40,7 @@ def to_linear(value: float) -> float:
 @wp.func
 def texel_at(texels: wp.array3d[wp.uint8], texture: int, cell: int) -> wp.vec3:
     """Return a texel, sRGB in [0, 255]."""
-    return wp.vec3(
-        float(texels[texture, cell, 0]), float(texels[texture, cell, 1]), float(texels[texture, cell, 2])
-    )
+    return wp.vec3(float(texels[texture, cell, 0]), float(texels[texture, cell, 1]), float(texels[texture, cell, 2]))
 
 
 @wp.func
@@ -123,9 +121,7 @@ def shade(
         v = uv_c - uv_a
         of_texels = wp.abs(u[0] * v[1] - u[1] * v[0]) * size * size
         of_pixels = view.focal * view.focal * wp.abs(wp.dot(wp.cross(side, other), at)) / (depth * depth * depth)
-        albedo = textured(
-            paint, texture, wa * uv_a + wb * uv_b + wc * uv_c, of_texels / wp.max(of_pixels, 1.0e-9)
-        )
+        albedo = textured(paint, texture, wa * uv_a + wb * uv_b + wc * uv_c, of_texels / wp.max(of_pixels, 1.0e-9))
     return wp.vec3(
         to_srgb(albedo[0] * light[0] + light[3]),
         to_srgb(albedo[1] * light[1] + light[3]),
@@ -135,8 +131,8 @@ def shade(
 
 @wp.func
 def background(
-    view: View, ground: Ground, center: wp.vec2, own: Grids, opacity: wp.array2d[float], c: int, at: wp.vec3,
-    share: float, x: float, y: float,
+    view: View, ground: Ground, own: Grids, opacity: wp.array2d[float], c: int, at: wp.vec3, share: float, x: float,
+    y: float,
 ) -> wp.vec3:  # fmt: skip
     """Return the sRGB colour of the ground or the sky at a pixel."""
     color = wp.lerp(ground.sky_top, ground.sky_bottom, y / float(view.height))
@@ -146,10 +142,23 @@ def background(
     return color
 
 
+@wp.func
+def triangle_of(key: wp.uint64) -> int:
+    """Return one more than the triangle of a sample's key; 0 where nothing is drawn."""
+    return int(key & wp.uint64(0xFFFFFFFF))
+
+
+@wp.func
+def inverse_depth_of(key: wp.uint64) -> float:
+    """Return the inverse depth of a sample's key [1/m]; 0 where nothing is drawn."""
+    return wp.cast(wp.uint32(key >> wp.uint64(32)), float)
+
+
 @wp.kernel
 def resolve(
     # in
     first: int,
+    threads: int,
     samples: int,
     ground: Ground,
     paint: Paint,
@@ -164,93 +173,105 @@ def resolve(
     keys: wp.array2d[wp.uint64],  # (C, samples)
     num_large: wp.array[int],
     # out
-    color: wp.array3d[wp.vec3],  # sRGB in [0, 1], (N, H, W)
-    nearest: wp.array3d[float],  # inverse depth [1/m], 0 where the sky is seen, (N, H, W)
-    labels: wp.array3d[wp.uint8],
+    color: wp.array2d[wp.vec3],  # sRGB in [0, 1], (N, H * W)
+    nearest: wp.array2d[float],  # inverse depth [1/m], 0 where the sky is seen, (N, H * W)
+    labels: wp.array2d[wp.uint8],
 ):
     """Average the samples of a pixel; where nothing was drawn, show the ground or the background."""
-    c, row, column = wp.tid()
+    c, thread = wp.tid()
     n = first + c
     view = views[n]
-    if row == 0 and column == 0:
-        num_large[c] = 0
-    x = float(column) + 0.5
-    y = float(row) + 0.5
-    at = ground_at(view, x, y)
-    share = ground_share(at, centers[n])
-    behind = wp.where(share > 0.0, at[2], 0.0)
+    own = grids[c]
+    center = centers[n]
+    albedo = wp.min(n, paint.albedo.shape[0] - 1)
     wide = samples * view.width
-    corner_sample = samples * row * wide + samples * column
-    total = wp.vec3()
-    drawn = int(0)
-    greatest = wp.uint64(0)
-    for i in range(samples * samples):
-        key = keys[c, corner_sample + (i // samples) * wide + i % samples]
-        own = int(key & wp.uint64(0xFFFFFFFF))
-        if own > 0 and wp.cast(wp.uint32(key >> wp.uint64(32)), float) > behind:
-            greatest = wp.max(greatest, key)
-            # A triangle is shaded once a pixel, amid the samples that show it.
+    of_pixel = samples * samples
+    spacing = 1.0 / float(samples)
+    if thread == 0:
+        num_large[c] = 0
+    for pixel in range(thread, view.height * view.width, threads):
+        row = pixel // view.width
+        column = pixel - row * view.width
+        corner_sample = samples * (row * wide + column)
+        greatest = wp.uint64(0)
+        for i in range(samples):
+            for j in range(samples):
+                greatest = wp.max(greatest, keys[c, corner_sample + i * wide + j])
+        x = float(column) + 0.5
+        y = float(row) + 0.5
+        at = ground_at(view, x, y)
+        share = ground_share(at, center)
+        behind = wp.where(share > 0.0, at[2], 0.0)
+        total = wp.vec3()
+        missing = of_pixel
+        label = int(0)
+        in_front = wp.max(inverse_depth_of(greatest), behind)
+        if inverse_depth_of(greatest) > behind:
+            label = paint.subject[triangle_of(greatest) - 1]
+        while inverse_depth_of(greatest) > behind:
+            # Every triangle is shaded once a pixel, amid the samples that show it; they are cleared on the way.
+            t = triangle_of(greatest) - 1
+            greatest = wp.uint64(0)
             count = int(0)
             place = wp.vec2()
-            is_first = bool(True)
-            for j in range(samples * samples):
-                other = keys[c, corner_sample + (j // samples) * wide + j % samples]
-                if int(other & wp.uint64(0xFFFFFFFF)) == own:
-                    if j < i:
-                        is_first = False
-                    if wp.cast(wp.uint32(other >> wp.uint64(32)), float) > behind:
-                        count += 1
-                        place += wp.vec2(float(j % samples), float(j // samples))
-            if is_first:
-                s = 1.0 / float(samples)
-                px = float(column) + (place[0] / float(count) + 0.5) * s
-                py = float(row) + (place[1] / float(count) + 0.5) * s
-                t = own - 1
-                corner = triangles[t]
-                seen = shade(
-                    view,
-                    paint,
-                    wp.min(n, paint.albedo.shape[0] - 1),
-                    t,
-                    corner,
-                    vertices[n, corner[0]],
-                    vertices[n, corner[1]],
-                    vertices[n, corner[2]],
-                    light[c, corner[0]],
-                    light[c, corner[1]],
-                    light[c, corner[2]],
-                    px,
-                    py,
-                )
-                total += float(count) * seen
-                drawn += count
-    missing = samples * samples - drawn
-    if missing > 0:
-        total += float(missing) * background(view, ground, centers[n], grids[c], opacity, c, at, share, x, y)
-    for i in range(samples * samples):
-        sample = corner_sample + (i // samples) * wide + i % samples
-        if keys[c, sample] != wp.uint64(0):
-            keys[c, sample] = wp.uint64(0)
-    color[n, row, column] = total / float(samples * samples)
-    front = int(greatest & wp.uint64(0xFFFFFFFF))
-    nearest[n, row, column] = wp.where(front > 0, wp.cast(wp.uint32(greatest >> wp.uint64(32)), float), behind)
-    if labels.shape[0] > 0:
-        labels[n, row, column] = wp.uint8(wp.where(front > 0, paint.subject[wp.max(front - 1, 0)], 0))
+            for i in range(samples):
+                for j in range(samples):
+                    sample = corner_sample + i * wide + j
+                    key = keys[c, sample]
+                    if triangle_of(key) != t + 1:
+                        greatest = wp.max(greatest, key)
+                    else:
+                        if inverse_depth_of(key) > behind:
+                            count += 1
+                            place += wp.vec2(float(j), float(i))
+                        keys[c, sample] = wp.uint64(0)
+            corner = triangles[t]
+            px = float(column) + (place[0] / float(count) + 0.5) * spacing
+            py = float(row) + (place[1] / float(count) + 0.5) * spacing
+            seen = shade(
+                view,
+                paint,
+                albedo,
+                t,
+                corner,
+                vertices[n, corner[0]],
+                vertices[n, corner[1]],
+                vertices[n, corner[2]],
+                light[c, corner[0]],
+                light[c, corner[1]],
+                light[c, corner[2]],
+                px,
+                py,
+            )
+            total += float(count) * seen
+            missing -= count
+        if greatest != wp.uint64(0):
+            for i in range(samples):
+                for j in range(samples):
+                    keys[c, corner_sample + i * wide + j] = wp.uint64(0)
+        if missing > 0:
+            total += float(missing) * background(view, ground, own, opacity, c, at, share, x, y)
+        color[n, pixel] = total / float(of_pixel)
+        nearest[n, pixel] = in_front
+        if labels.shape[0] > 0:
+            labels[n, pixel] = wp.uint8(label)
 
 
 @wp.kernel
 def to_bytes(
     # in
-    color: wp.array3d[wp.vec3],  # sRGB in [0, 1], (N, H, W)
-    nearest: wp.array3d[float],  # [1/m]
+    threads: int,
+    color: wp.array2d[wp.vec3],  # sRGB in [0, 1], (N, H * W)
+    nearest: wp.array2d[float],  # [1/m]
     # out
-    picture: wp.array4d[wp.uint8],  # (N, H, W, 3)
-    depth: wp.array3d[float],  # [m], infinite in the sky
+    picture: wp.array2d[wp.uint8],  # (N, H * W * 3)
+    depth: wp.array2d[float],  # [m], infinite in the sky
 ):
     """Round the colours to bytes, and turn inverse depths into depths."""
-    n, row, column = wp.tid()
-    seen = color[n, row, column]
-    for channel in range(3):
-        picture[n, row, column, channel] = wp.uint8(wp.clamp(255.0 * seen[channel] + 0.5, 0.0, 255.0))
-    if depth.shape[0] > 0:
-        depth[n, row, column] = 1.0 / nearest[n, row, column]
+    n, thread = wp.tid()
+    for pixel in range(thread, color.shape[1], threads):
+        seen = color[n, pixel]
+        for channel in range(3):
+            picture[n, 3 * pixel + channel] = wp.uint8(wp.clamp(255.0 * seen[channel] + 0.5, 0.0, 255.0))
+        if depth.shape[0] > 0:
+            depth[n, pixel] = 1.0 / nearest[n, pixel]

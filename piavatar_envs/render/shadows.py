@@ -57,6 +57,8 @@ _LAYERS = wp.constant(LAYER_TEXELS)
 _FIRST_1, _FIRST_2, _FIRST_3 = (wp.constant(n) for n in _FIRST[1:4])
 #: Upper ends of the lower bands [m].
 _LOW_BAND, _MIDDLE_BAND = wp.constant(0.25), wp.constant(0.9)
+#: Lower than this nothing casts a shadow on the ground from below [m].
+_SUNK = wp.constant(-0.1)
 #: Height over which the shadow of contact fades [m], and the greatest opacities of the cast shadow and of that one.
 _CONTACT_HEIGHT = wp.constant(0.04)
 _STRENGTH, _CONTACT_STRENGTH = wp.constant(0.42), wp.constant(0.50)
@@ -145,7 +147,7 @@ def place_grids(
     # out
     grids: wp.array[Grids],
 ):
-    """Place the grids around the surfaces; their corners lie on multiples of their cells, so that they do not shimmer."""
+    """Place the grids around the surfaces, on multiples of their cells, so that shadows do not shimmer."""
     c = wp.tid()
     least = vec7()
     greatest = vec7()
@@ -214,6 +216,7 @@ def clear_grids(
     for i in range(thread, _LAYERS, threads):
         cover[c, i] = 0
 
+
 @wp.func
 def patch_cell(own: Grids, x: float, y: float, shift: int) -> int:
     """Return the cell of a layer of the patch at a point of the ground [m], -1 outside."""
@@ -226,7 +229,13 @@ def patch_cell(own: Grids, x: float, y: float, shift: int) -> int:
 
 @wp.func
 def cast_piece(
-    own: Grids, c: int, at: wp.vec3, area: wp.vec3, depth: wp.array2d[int], filled: wp.array2d[int], cover: wp.array2d[int]
+    own: Grids,
+    c: int,
+    at: wp.vec3,
+    area: wp.vec3,
+    depth: wp.array2d[int],
+    filled: wp.array2d[int],
+    cover: wp.array2d[int],
 ):
     """Cast the shadow of a piece of surface at ``at`` [m] with area vector ``area`` [m^2]."""
     row = int((wp.dot(MAP_X, at) - own.map_origin[0]) / own.map_texel)
@@ -245,7 +254,7 @@ def cast_piece(
     height = wp.max(at[2], 0.0)
     # The sides that face the light, seen from it and laid on the ground, add up to the silhouette.
     facing = wp.dot(KEY, area)
-    if facing > 0.0:
+    if facing > 0.0 and at[2] > _SUNK:
         shift = wp.where(height <= _LOW_BAND, 0, wp.where(height <= _MIDDLE_BAND, 1, 2))
         first = wp.where(shift == 0, 0, wp.where(shift == 1, _FIRST_1, _FIRST_2))
         cell = patch_cell(own, at[0] - height * _SLANT[0], at[1] - height * _SLANT[1], shift)
@@ -253,7 +262,7 @@ def cast_piece(
             texel = own.patch_texel * float(1 << shift)
             units = wp.min(facing / (KEY[2] * texel * texel) * _COVER_UNITS, _COVER_MOST)
             wp.atomic_add(cover, c, first + cell, int(units + 0.5))
-    if area[2] < 0.0 and height < 4.0 * _CONTACT_HEIGHT:
+    if area[2] < 0.0 and height < 4.0 * _CONTACT_HEIGHT and at[2] > _SUNK:
         cell = patch_cell(own, at[0], at[1], 1)
         if cell >= 0:
             texel = 2.0 * own.patch_texel
@@ -504,9 +513,7 @@ class Shadows:
             self._surfaces, self._depths, self._areas, self._covers,
         )  # fmt: skip
         k = threads(surfaces.num_vertices)
-        graph.launch(
-            find_extents, (count, k), [first, surfaces.num_vertices, k, vertices], [self._low, self._high]
-        )
+        graph.launch(find_extents, (count, k), [first, surfaces.num_vertices, k, vertices], [self._low, self._high])
         graph.launch(place_grids, count, [self._low, self._high], [self.grids])
         cells = threads(LAYER_TEXELS)
         graph.launch(clear_grids, (count, cells), [cells, self.grids], [depth, area, cover])
@@ -517,8 +524,6 @@ class Shadows:
             [first, k, surfaces.triangles, vertices, self.grids],
             [self.areas, depth, area, cover],
         )
-        graph.launch(
-            blur_first, (count, cells), [cells, self.grids, depth, area, cover], [widened, area_2, cover_2]
-        )
+        graph.launch(blur_first, (count, cells), [cells, self.grids, depth, area, cover], [widened, area_2, cover_2])
         graph.launch(blur_second, (count, cells), [cells, self.grids, area_2, cover_2], [area, cover])
         graph.launch(blur_third, (count, cells), [cells, self.grids, area, cover], [area_2, self.opacity])

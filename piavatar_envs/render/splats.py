@@ -19,7 +19,7 @@ import warp as wp
 
 from piavatar_envs.core.arrays import vec6, vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.render.raster import View
+from piavatar_envs.render.views import View
 
 wp.set_module_options({"enable_backward": False})
 

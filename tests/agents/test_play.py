@@ -21,7 +21,7 @@ from piavatar_envs.tasks import load_task  # noqa: E402
 
 
 def test_settings_win_and_a_film_is_written(run_of, device, tmp_path, capsys):
-    pytest.importorskip("pyvista", reason="needs the extra render")
+    pytest.importorskip("PIL", reason="needs the extra render")
     film = tmp_path / "film.gif"
     small = ("env.render.width=64", "render.height=64")
     line = [str(run_of("ppo")), "episode_seconds=0.1", *small, "--film", str(film)]

@@ -22,18 +22,17 @@ def test_a_closed_view_refuses_to_go_on(build, device):
     view.close()
 
 
-@pytest.mark.parametrize("module", ["pyvista", "PIL"])
-def test_pictures_without_the_extra_are_refused_when_an_environment_is_made(module, monkeypatch):
+def test_a_scale_without_the_library_of_text_is_refused_when_an_environment_is_made(monkeypatch):
     pytest.importorskip("pettingzoo", reason="needs the extra multi")
     from piavatar_envs.multi import sumo_v0
 
-    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, "PIL", None)
     monkeypatch.setattr("piavatar_envs.api.host.BatchEnv", None)  # nothing is built
-    settings = {"render_mode": "rgb_array", "fidelity": "tiny"}
+    settings = {"render_mode": "rgb_array", "fidelity": "tiny", "color": "strain"}
     for make in (
         lambda: gymnasium.make("PIAvatar/Reach-v0", **settings),
         lambda: gymnasium.make_vec("PIAvatar/Reach-v0", num_envs=2, **settings),
         lambda: sumo_v0.parallel_env(**settings),
     ):
-        with pytest.raises(ImportError, match=rf"render_mode='rgb_array' needs {module}, .*\[render\]"):
+        with pytest.raises(ImportError, match=r"color='strain' needs PIL, .*\[render\]"):
             make()

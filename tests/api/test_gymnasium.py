@@ -234,7 +234,6 @@ def test_info_has_the_wrench_that_holds_the_body(make_env, sample_id):
 
 
 def make_pictured(device, env_id: str, size: tuple[int, int] = (64, 48), **settings):
-    pytest.importorskip("pyvista")
     settings = {"render_mode": "rgb_array", "width": size[0], "height": size[1], **settings}
     return gymnasium.make(env_id, device=device, fidelity="tiny", **settings).unwrapped
 

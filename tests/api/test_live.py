@@ -60,7 +60,6 @@ def shown(env) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("color", ["skin", "strain"])
 def test_the_view_shows_the_scene_of_the_picture(make_human, device, monkeypatch, color):
-    pytest.importorskip("pyvista")
     seen = []
 
     def keep(_renderer, bodies, markers=(), **_more):

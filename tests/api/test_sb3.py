@@ -133,7 +133,6 @@ def test_attributes_and_methods_are_those_of_the_vector(make_sb3, make_env, equa
 
 
 def test_pictures_are_tiled(device):
-    pytest.importorskip("pyvista")
     vector = SB3VecEnv("Reach-v0", 2, "rgb_array", device, fidelity="tiny", width=32, height=32)
     vector.reset()
     assert vector.render().shape == (64, 32, 3) or vector.render().shape == (32, 64, 3)

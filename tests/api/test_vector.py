@@ -469,7 +469,6 @@ def test_a_bad_state_is_refused_and_changes_nothing(make_vec, spoil):
 
 
 def test_pictures_are_those_of_single_environments(device):
-    pytest.importorskip("pyvista")
     settings = {"device": device, "fidelity": "tiny", "render_mode": "rgb_array", "width": 64, "height": 48}
     vector = AvatarVectorEnv("KickBall-v0", 3, num_threads=2, **settings)
     single = gymnasium.make(KICK, **settings).unwrapped

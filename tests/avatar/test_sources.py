@@ -111,7 +111,6 @@ def test_shapes_of_one_source_are_drawn_under_its_own_names(device):
 
 
 def test_pictures_show_the_look_in_its_colours_unless_a_quantity_is_asked_for(device):
-    pytest.importorskip("pyvista")
     asset = load_asset()
     green = np.tile(np.array([[30, 200, 40]], np.uint8), (len(asset.drawn.vertices), 1))
     looks = dataclasses.replace(asset, look=dataclasses.replace(asset.drawn, colors=green))

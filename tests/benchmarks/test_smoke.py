@@ -261,7 +261,7 @@ def test_every_study_of_the_supplement_is_judged(tmp_path, device):
 
 
 def test_a_figure_of_the_supplement_is_drawn(tmp_path):
-    pytest.importorskip("pyvista")
+    pytest.importorskip("PIL", reason="needs the extra render")
     options = supplement_figures.Options(folder=tmp_path, only=("several_objects",), fidelity="tiny", still=True)
     (path,) = supplement_figures.main(options)
     assert path.stat().st_size > 5_000

@@ -65,7 +65,7 @@ def test_listing_is_light_and_a_missing_pettingzoo_is_named():
 import sys
 from piavatar_envs.multi import listed_games
 assert listed_games()
-print([name for name in ("warp", "torch", "pyvista") if name in sys.modules])
+print([name for name in ("warp", "torch", "viser") if name in sys.modules])
 for name in list(sys.modules):
     if name.startswith(("pettingzoo", "piavatar_envs")):
         del sys.modules[name]
@@ -371,7 +371,6 @@ def test_max_cycles_wins_over_episode_seconds(fresh):
 
 
 def test_pictures_show_every_game_and_change_nothing(fresh, game_name, play):
-    pytest.importorskip("pyvista")
     small = {"render.width": 64, "render.height": 48}
     game = fresh(game_name).parallel_env(render_mode="rgb_array", **small)
     game.reset(seed=0)
@@ -386,7 +385,6 @@ def test_pictures_show_every_game_and_change_nothing(fresh, game_name, play):
 
 
 def test_a_game_is_watched_and_pettingzoos_render_test_passes(fresh, play):
-    pytest.importorskip("pyvista")
     pytest.importorskip("viser")
     official.render_test(functools.partial(fresh(GAME).env, **{"render.width": 64, "render.height": 48}))
     game = fresh(GAME).parallel_env(render_mode="human")
