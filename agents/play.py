@@ -2,8 +2,8 @@
 
 Takes the folder of a run with one agent, by ``agents.rsl_rl.train`` (policy.pt) or ``agents.sb3.train`` (policy.zip),
 builds the environment of its config.yaml, and plays the episodes of its evaluation. Of an interrupted training it
-takes the policy in the checkpoint. With ``--film`` alone it plays no others; with ``--live`` it plays in a web browser
-instead, until Ctrl-C. Nothing in the files is unpickled.
+takes the policy in the checkpoint. With ``--film`` or ``--export`` alone it plays no others; with ``--live`` it plays
+in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
 
 A video of one agent, or of two in the same episodes side by side.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -37,7 +37,9 @@ from piavatar_envs.core.writing import check_writable
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.envs.task import Task
+from piavatar_envs.export import Recording, check_folder
 from piavatar_envs.render import label, side_by_side, write_video
+from piavatar_envs.render.film_files import check_format
 from piavatar_envs.render.video import check_suffix
 from piavatar_envs.tasks import load_task
 
@@ -134,7 +136,7 @@ class Options:
     run: tyro.conf.Positional[Path]
     #: settings of the environment that win over the run's: fidelity=tiny, or as for the training env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
-    #: episodes to score, by default as many as the training's evaluation has, or none with --film alone
+    #: episodes to score, by default as many as the training's evaluation has, or none with --film or --export alone
     episodes: int | None = None
     #: seed of the first episode, by default that of the training's evaluation
     first_seed: int | None = None
@@ -150,6 +152,10 @@ class Options:
     film_episodes: int = 1
     #: control steps between two of its pictures
     film_every: int = 1
+    #: folder for the meshes of the same episodes, frame by frame, for Blender and other programs
+    export: Path | None = None
+    #: of those files; usd needs the extra usd
+    format: Literal["glb", "ply", "usd"] = "glb"
     #: play one episode after the other in a web browser until Ctrl-C, instead of evaluating (needs the extra live)
     live: bool = False
     #: port of that view on this machine, or the next one that is free
@@ -161,10 +167,12 @@ def check_options(options: Options) -> None:
 
     Raises:
         ConfigError: options that do not go together, no episodes, no pictures, or files that cannot be written.
-        ValueError: a seed that there is not, or what is no video by its name.
+        ImportError: the extra ``usd`` is not installed, for that format.
+        ValueError: a seed that there is not, what is no video by its name, or a folder that holds something.
     """
-    if options.live and (options.out or options.film or options.episodes is not None):
-        raise ConfigError("--live plays until Ctrl-C and evaluates nothing; leave out --out, --film and --episodes")
+    if options.live and (options.out or options.film or options.export or options.episodes is not None):
+        others = "--out, --film, --export and --episodes"
+        raise ConfigError(f"--live plays until Ctrl-C and evaluates nothing; leave out {others}")
     if options.episodes is not None and options.episodes < 2:
         advice = "of one there is no interval; a film alone needs no --episodes"
         raise ConfigError(f"episodes={options.episodes} must be >= 2: {advice}")
@@ -173,6 +181,9 @@ def check_options(options: Options) -> None:
     if options.out:
         check_figures(options.out, "play")
     check_film(options.film, options.film_every, options.film_episodes)
+    if options.export:
+        check_format(options.format)
+        check_folder(options.export)
     if options.first_seed is not None:
         check_seeds(options.first_seed, name="first_seed")
 
@@ -260,6 +271,26 @@ def film_run(run: Run, agent: Agent, seconds: float, first: int, options: Option
     print(f"wrote {options.film}")
 
 
+def export_run(run: Run, first: int, options: Options, env: dict[str, Any]) -> None:
+    """Write the meshes of the episodes of a film; arguments as for :func:`film_run`."""
+    made = EnvFactory(run.env_id, env, options.device)()
+    agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
+    try:
+        recording = Recording(made, options.export, options.format)
+        for seed in tqdm(range(first, first + options.film_episodes), desc="export", unit="episode"):
+            begin_round(agent, 1)
+            (observation, _), over = made.reset(seed=seed), False
+            recording.add()
+            while not over:
+                observation, _, terminated, truncated, _ = made.step(agent(observation[None, None])[0, 0])
+                recording.add()
+                over = terminated or truncated
+        paths = recording.finish()
+    finally:
+        made.close()
+    print("wrote", *paths)
+
+
 def film(
     path: Path, make: EnvFactory, agents: dict[str, Agent], seeds: Sequence[int], fps: float, every: int = 1
 ) -> Path:
@@ -328,7 +359,7 @@ def main(args: list[str] | None = None) -> None:
     """Run the command line."""
     options = read_options(Options, "play", args)
     quiet_warp()
-    scores = options.film is None or options.out is not None or options.episodes is not None
+    scores = not (options.film or options.export) or options.out is not None or options.episodes is not None
     with one_line_errors(ValueError, ImportError):
         check_options(options)
         run = open_run(options.run, options.device, options.imports)
@@ -348,6 +379,8 @@ def main(args: list[str] | None = None) -> None:
         batch.close()
         if options.film:
             film_run(run, agent, task.config.physics.control_dt, first, options, env)
+        if options.export:
+            export_run(run, first, options, env)
 
 
 if __name__ == "__main__":

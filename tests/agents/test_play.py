@@ -36,6 +36,17 @@ def test_settings_win_and_a_film_is_written(run_of, device, tmp_path, capsys):
     assert "trained" in capsys.readouterr().out
 
 
+def test_an_episode_is_exported(run_of, device, tmp_path, capsys):
+    line = [str(run_of("ppo")), "episode_seconds=0.1", "--export", str(tmp_path / "film"), "--format", "ply"]
+    capsys.readouterr()
+    play.main([*line, "--device", device])
+    assert "trained" not in capsys.readouterr().out, "an export alone plays no other episodes"
+    files = sorted(file.name for file in (tmp_path / "film" / "body_0").iterdir())
+    assert files == [f"{frame:04d}.ply" for frame in range(4)]
+    with pytest.raises(SystemExit, match="not empty"):
+        play.main(line)  # the folder holds a film
+
+
 QUICK = ("env.fidelity=tiny", "env.episode_seconds=0.2", "evaluation.episodes=3")
 TRAININGS = {
     "rsl": (
