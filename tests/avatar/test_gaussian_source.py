@@ -82,7 +82,14 @@ def test_particles_fill_it_and_its_skin_has_the_colours(body):
     assert len(sample_particles(body, 0.05)) > 300
     trousers = body.look.colors[(body.vertices[:, 2] > 0.4) & (body.vertices[:, 2] < 0.6)].mean(axis=0)
     np.testing.assert_allclose(trousers, [46, 64, 115], atol=20)
-    assert source_of("x.spz") == "gaussian"
+
+
+def test_the_source_is_found_by_the_file(file, tmp_path):
+    assert source_of("x.spz") == source_of(file) == "gaussian"
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    (tmp_path / "a.gltf").write_text('{"extensionsUsed": ["KHR_gaussian_splatting"]}')
+    assert source_of(tmp_path / "a.ply") == source_of("none.ply") == "mesh"
+    assert source_of(tmp_path / "a.gltf") == "gaussian" and source_of("none.gltf") == "glb"
 
 
 @pytest.fixture

@@ -68,6 +68,18 @@ def read_splats(path: str | Path) -> SplatCloud:
         return readers[path.suffix.lower()](path)
 
 
+def holds_splats(path: str | Path) -> bool:
+    """Return whether the beginning of a file names splats; False where there is no such file."""
+    try:
+        with Path(path).open("rb") as stream:
+            head = stream.read(MAX_HEADER)
+    except OSError:
+        return False
+    if head.startswith(b"ply"):
+        return b" f_dc_0" in head or b" packed_position" in head
+    return f'"{_EXTENSION}"'.encode() in head
+
+
 def write_ply(path: str | Path, cloud: SplatCloud) -> None:
     """Write splats as a 3DGS ``.ply``: binary, little endian.
 

@@ -21,6 +21,8 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
+from piavatar_envs.avatar.body.splat_files import SUFFIXES as SPLAT_SUFFIXES
+from piavatar_envs.avatar.body.splat_files import holds_splats
 from piavatar_envs.avatar.gltf import check_format
 from piavatar_envs.core.reading import files_behind, reading
 
@@ -69,7 +71,7 @@ def check_source(name: str) -> str:
 
 
 def source_of(path: str | Path) -> str:
-    """Return the name of the source that reads files of such a name.
+    """Return the name of the source that reads files of such a name; for splats also by the beginning of the file.
 
     Raises:
         ValueError: none does.
@@ -79,6 +81,8 @@ def source_of(path: str | Path) -> str:
     for name in sorted(_own_modules()):
         for own in getattr(importlib.import_module(f"{__name__}.{name}"), "SUFFIXES", ()):
             known.setdefault(own, name)
+    if suffix in SPLAT_SUFFIXES and holds_splats(path):
+        return "gaussian"
     if suffix not in known:
         with reading(path, "a character"):
             check_format(Path(path))
