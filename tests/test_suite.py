@@ -119,7 +119,7 @@ def test_observations_are_finite_and_none_is_constant(make_env, env_id):
 
 def test_environments_with_the_same_body_share_a_skin(make_env):
     batch = make_env(SAMPLE[0]).batch
-    skins = [SceneReader(batch)._skin(0, 0, batch.simulation.flesh[0]) for _ in range(2)]
+    skins = [SceneReader(batch).stage.skins[0] for _ in range(2)]
     assert skins[0] is skins[1]
 
 

@@ -118,6 +118,10 @@ class _Backdrop:
     camera_target: tuple[float, float, float]
     camera_follows: bool = False
 
+    def marker_specs(self) -> tuple:
+        """Return no markers, as only matter is drawn."""
+        return ()
+
     def markers(self, _stage: Stage, _env: int) -> tuple:
         """Return no markers, as only matter is drawn."""
         return ()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal
 
@@ -18,15 +19,16 @@ from piavatar_envs.avatar.skinning import unpack
 from piavatar_envs.config import RenderConfig
 from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.core.extras import missing
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.sim.bodies import Flesh
 from piavatar_envs.sim.forces import Target
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from piavatar_envs.render import Arrow, Body, Camera, Marker, Scene, Skin
+    from piavatar_envs.render import Arrow, Camera, Marker, Scene
     from piavatar_envs.render.live import Drag, LiveView
+    from piavatar_envs.render.stage import Stage
 
 #: Render modes of one environment, and of a batch: a live view shows one.
 RENDER_MODES = ("rgb_array", "human")
@@ -74,94 +76,60 @@ def check_batch_render_mode(render_mode: str | None) -> str | None:
 
 
 class SceneReader:
-    """Reads scene descriptions from a batch: skins, props, colliders and the task's markers."""
+    """Reads scene descriptions from a batch: skins, props, colliders and the task's markers.
+
+    Everything is computed on the device of the batch, and only what is shown leaves it.
+    """
 
     def __init__(self, batch: BatchEnv) -> None:
-        """Bake the surfaces of the props; skins follow when they are first drawn."""
-        from piavatar_envs.render import SolidSurface
-
+        """Bake nothing yet; the first scene does."""
         self.batch = batch
-        self._skins: dict[tuple[int, bytes], Skin] = {}
-        self._solids = [SolidSurface(p.rest, p.vertices, p.faces) for p in batch.simulation.props.points]
+
+    @cached_property
+    def stage(self) -> Stage:
+        """The surfaces of one environment."""
+        from piavatar_envs.render.stage import Stage
+
+        return Stage(self.batch.simulation, self.batch.task.marker_specs(), envs=[0])
+
+    @cached_property
+    def _graph(self) -> LaunchGraph:
+        """The launches that write the vertices of the stage."""
+        graph, task = LaunchGraph(self.batch.simulation.device), self.batch.task
+        if task.marker_specs():
+            task.record_markers(self.batch, graph, self.stage.markers)
+        self.stage.record(graph)
+        return graph
 
     def scene(self, env: int, color: Literal["skin", "strain"] = "skin") -> Scene:
         """Describe the scene of environment ``env`` now, the bodies in their own colour or coloured by strain."""
-        from piavatar_envs.render import Scene, Sphere
+        from piavatar_envs.render import Body, Scene, Solid, Sphere
 
-        task, x = self.batch.task, self.batch.simulation.state.x.numpy()[env]
-        bodies = self._avatars(env, x, color) + self._props(env, x)
-        markers = [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
-        roots = [avatar.tracked.position.numpy()[env, 0] for avatar in self.batch.simulation.avatars]
+        simulation, task = self.batch.simulation, self.batch.task
+        self.stage.select([env])
+        self._graph.run()
+        vertices = self.stage.vertices.numpy()[0].copy()
+        bodies: list[Body] = []
+        markers: list[Marker] = []
+        for part in self.stage.parts:
+            own = vertices[part.vertices]
+            if part.kind in ("avatar", "prop"):
+                strain = self._strain(env, len(bodies)) if color == "strain" and part.kind == "avatar" else None
+                bodies.append(Body(own, part.faces, part.color, part.colors, scalars=strain))
+            elif np.isfinite(own[0, 0]):  # hidden ones are NaN
+                markers.append(Solid(part.kind, own, part.faces, part.color))
+        markers += [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
+        roots = [avatar.tracked.position.numpy()[env, 0] for avatar in simulation.avatars]
         follow = np.mean(roots, axis=0) if task.camera_follows else None
-        return Scene(bodies, markers + self._colliders(env), follow)
+        return Scene(bodies, markers, follow)
 
-    def _skin(self, env: int, avatar: int, flesh: Flesh) -> Skin:
-        """Return the skin of an avatar's present body; a body that comes back is not baked again."""
-        from piavatar_envs.render import Skin
+    def _strain(self, env: int, index: int) -> np.ndarray:
+        """Return the strain of an avatar at its vertices."""
+        from piavatar_envs.render import strain_magnitude
 
-        key = (avatar, flesh.shape_parameters[env].tobytes())
-        if key not in self._skins:
-            points, row = flesh.points, min(env, len(flesh.points.rest) - 1)
-            shaped = flesh.asset.shape_drawn(flesh.shape_parameters[env])
-            self._skins = {other: skin for other, skin in self._skins.items() if other[0] != avatar}
-            self._skins[key] = Skin.baked(
-                flesh.asset.drawn,
-                shaped,
-                points.rest[row],
-                points.skin_joints,
-                points.skin_weights,
-                points.correctives,
-            )
-        return self._skins[key]
-
-    def _avatars(self, env: int, x: np.ndarray, color: str) -> list[Body]:
-        from scipy.spatial.transform import Rotation
-
-        from piavatar_envs.render import PALETTE, Body, strain_magnitude
-
-        simulation, bodies = self.batch.simulation, []
-        for index, (flesh, avatar) in enumerate(zip(simulation.flesh, simulation.avatars, strict=True)):
-            own, skin = slice(avatar.body.first, avatar.body.first + avatar.body.count), self._skin(env, index, flesh)
-            rotations = Rotation.from_quat(avatar.tracked.rotation.numpy()[env]).as_matrix()
-            vertices = skin.deform(rotations, avatar.tracked.position.numpy()[env], x[own])
-            scalars = None
-            if color == "strain":
-                F = matrices_of(simulation.state.F.numpy()[env])
-                scalars = skin.interpolate(strain_magnitude(F[own]))
-            drawn, color_of_all = flesh.asset.drawn, PALETTE[index % len(PALETTE)]
-            bodies.append(Body(vertices, drawn.faces, color_of_all, drawn.colors_of(index), scalars=scalars))
-        return bodies
-
-    def _props(self, env: int, x: np.ndarray) -> list[Body]:
-        from scipy.spatial.transform import Rotation
-
-        from piavatar_envs.render import PROP, Body
-
-        props, bodies = self.batch.simulation.props, []
-        for index, (prop, solid) in enumerate(zip(props.props, self._solids, strict=True)):
-            rotation = Rotation.from_quat(props.state.rotation.numpy()[env, index]).as_matrix()
-            particles = x[prop.first : prop.first + prop.count]
-            vertices = solid.deform(rotation, props.state.position.numpy()[env, index], particles)
-            bodies.append(Body(vertices, solid.faces, color=PROP))
-        return bodies
-
-    def _colliders(self, env: int) -> list[Marker]:
-        """Describe the scene's boxes, spheres and capsules; planes are not drawn."""
-        from scipy.spatial.transform import Rotation
-
-        from piavatar_envs.render import PROP, Box, Capsule, Sphere
-
-        boundaries, shapes = self.batch.simulation.model.boundaries, []
-        for index, collider in enumerate(self.batch.simulation.subjects.colliders):
-            position = boundaries.position.numpy()[env, index]
-            rotation = Rotation.from_quat(boundaries.rotation.numpy()[env, index]).as_matrix()
-            if collider.kind == "box":
-                shapes.append(Box(position, np.array(collider.size), rotation=rotation))
-            elif collider.kind == "sphere":
-                shapes.append(Sphere(position, collider.size[0], color=PROP))
-            elif collider.kind == "capsule":
-                shapes.append(Capsule(position, *collider.size, rotation=rotation))
-        return shapes
+        body = self.batch.simulation.avatars[index].body
+        F = matrices_of(self.batch.simulation.state.F.numpy()[env])[body.first : body.first + body.count]
+        return self.stage.skins[index].interpolate(strain_magnitude(F))
 
 
 class Progress:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
     from piavatar_envs.envs.episodes import EpisodeArrays
     from piavatar_envs.render.scene import Marker
+    from piavatar_envs.sim.markers import Markers, MarkerSpec
 
 #: Prefixes of the terms of reward and cost in ``info``; no metric's name can begin with one.
 REWARD, COST = "reward_", "cost_"
@@ -402,11 +403,36 @@ class Task:
     def record_observe(self, env: EpisodeArrays, graph: LaunchGraph, agent: int, start: int) -> None:
         """Append: write the task's observation terms from component ``start``. Must not change any state."""
 
+    def marker_specs(self) -> Sequence[MarkerSpec]:
+        """Return what pictures show besides matter, such as a target; where it moves, see :meth:`record_markers`."""
+        return ()
+
+    def record_markers(self, env: EpisodeArrays, graph: LaunchGraph, markers: Markers) -> None:
+        """Append launches that write the rows of the declared markers from the present state, of all environments.
+
+        Must not change any state. Columns are in the order of :meth:`marker_specs`; those that no launch writes stay
+        where their specifications put them.
+        """
+
     def markers(
         self, env: EpisodeArrays, index: int
     ) -> Sequence[tuple[np.ndarray, float, tuple[float, float, float]] | Marker]:
-        """Return marks to draw for environment ``index``: spheres ``(position [m], radius [m], rgb)``, or markers.
+        """Return further marks for environment ``index``: spheres ``(position [m], radius [m], rgb)``, or markers.
 
-        Markers of the renderer are imported here and nowhere else in a task, so that a task needs no renderer.
+        Markers are those of :mod:`piavatar_envs.render`. They are computed on the host, so that ``render()`` and the
+        live view show them, and observed pixels cannot; see :meth:`check_pixels`.
         """
         return []
+
+    def check_pixels(self) -> None:
+        """Refuse pixels as observations of a task that describes marks on the host.
+
+        Raises:
+            ConfigError: it overrides :meth:`markers`.
+        """
+        if type(self).markers is not Task.markers:
+            name = type(self).__name__
+            raise ConfigError(
+                f"{name}.markers describes marks on the host, which pixels that agents observe cannot show; declare "
+                f"them in {name}.marker_specs and move them in record_markers, or use obs_mode='flat'"
+            )

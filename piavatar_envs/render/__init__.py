@@ -3,8 +3,21 @@
 from piavatar_envs.render.coloring import strain_magnitude
 from piavatar_envs.render.overlay import label, side_by_side
 from piavatar_envs.render.renderer import Renderer
-from piavatar_envs.render.scene import PALETTE, PROP, Arrow, Body, Box, Camera, Capsule, Marker, Ring, Scene, Sphere
-from piavatar_envs.render.skin import Skin, SolidSurface
+from piavatar_envs.render.scene import (
+    PALETTE,
+    PROP,
+    Arrow,
+    Body,
+    Box,
+    Camera,
+    Capsule,
+    Marker,
+    Ring,
+    Scene,
+    Solid,
+    Sphere,
+)
+from piavatar_envs.render.skin import Skin
 from piavatar_envs.render.video import write_video
 
 __all__ = [
@@ -20,7 +33,7 @@ __all__ = [
     "Ring",
     "Scene",
     "Skin",
-    "SolidSurface",
+    "Solid",
     "Sphere",
     "label",
     "side_by_side",

@@ -232,7 +232,7 @@ def _meshes(scene: Scene) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, C
             yield f"{name}_band_{band.number}", (band.vertices, band.faces, band.color)
     for index, marker in enumerate(scene.markers):
         vertices, faces = marker.mesh()
-        yield f"{_WORLD}/{type(marker).__name__.lower()}_{index}", (vertices, faces, marker.color)
+        yield f"{_WORLD}/{marker.kind}_{index}", (vertices, faces, marker.color)
 
 
 def _bytes(color: Color) -> tuple[int, int, int]:

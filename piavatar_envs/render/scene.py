@@ -5,22 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.render.markers import placed_mesh, turn_to_direction
+from piavatar_envs.sim.markers import TARGET, WIRE
 
 Color = tuple[float, float, float]
 
 #: sRGB in [0, 1].
 CLAY: Color = (0.86, 0.76, 0.69)
 PALETTE: tuple[Color, ...] = (CLAY, (0.49, 0.67, 0.82), (0.62, 0.76, 0.55), (0.80, 0.62, 0.80))
-TARGET: Color = (0.95, 0.36, 0.23)
 IMPULSE: Color = (0.93, 0.68, 0.16)
 PROP: Color = (0.55, 0.60, 0.66)
-
-_SPHERE_RINGS, _SPHERE_SEGMENTS = 20, 32
-_ARROW_SEGMENTS = 24
-_BOX_CELLS = 6
-_RING_SEGMENTS, _WIRE_SEGMENTS = 48, 12
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +54,11 @@ class Sphere:
     radius: float
     color: Color = TARGET
 
+    kind: ClassVar[str] = "sphere"
+
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
-        vertices, faces = _UNIT_SPHERE
-        return np.asarray(self.position, dtype=np.float64) + self.radius * vertices, faces
+        return placed_mesh("sphere", (self.radius,), self.position, _UPRIGHT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +70,12 @@ class Arrow:
     color: Color = IMPULSE
     radius: float = 0.018
 
+    kind: ClassVar[str] = "arrow"
+
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
-        vector = np.asarray(self.vector, dtype=np.float64)
-        length = float(np.linalg.norm(vector))
-        axis = vector / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
-        side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [1.0, 0.0, 0.0])
-        side /= np.linalg.norm(side)
-        head = min(5.0 * self.radius, 0.5 * length)
-        # Radius and height of the rings, from the tail to the tip; doubled where an edge shall stay sharp.
-        neck = length - head
-        radii = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 2.4, 2.4, 0.0, 0.0]) * self.radius
-        heights = np.array([0.0, 0.0, 0.0, 0.0, neck, neck, neck, neck, length, length])
-        local = _revolve(np.stack([radii, heights], axis=-1))
-        frame = np.stack([side, np.cross(axis, side), axis])
-        return np.asarray(self.start, dtype=np.float64) + local @ frame, _ARROW_FACES
+        length = float(np.linalg.norm(self.vector))
+        return placed_mesh("arrow", (self.radius, length), self.start, turn_to_direction(self.vector))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +87,11 @@ class Box:
     color: Color = PROP
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
+    kind: ClassVar[str] = "box"
+
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
-        vertices, faces = _UNIT_BOX
-        local = vertices * np.asarray(self.half_size, dtype=np.float64)
-        return np.asarray(self.position, dtype=np.float64) + local @ np.asarray(self.rotation).T, faces
+        return placed_mesh("box", self.half_size, self.position, _quaternion(self.rotation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +104,11 @@ class Capsule:
     color: Color = PROP
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
+    kind: ClassVar[str] = "capsule"
+
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
-        vertices, faces = _UNIT_SPHERE
-        local = self.radius * vertices
-        local[:, 2] += np.where(vertices[:, 2] >= 0.0, self.half_length, -self.half_length)
-        return np.asarray(self.position, dtype=np.float64) + local @ np.asarray(self.rotation).T, faces
+        return placed_mesh("capsule", (self.radius, self.half_length), self.position, _quaternion(self.rotation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,26 +122,40 @@ class Ring:
     position: np.ndarray
     normal: np.ndarray
     radius: float
-    wire: float = 0.02
+    wire: float = WIRE
     color: Color = TARGET
     lowest: float = 0.0
 
+    kind: ClassVar[str] = "ring"
+
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
-        position, normal = np.asarray(self.position, dtype=np.float64), np.asarray(self.normal, dtype=np.float64)
-        up = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
-        up -= (up @ normal) * normal
-        up /= np.linalg.norm(up)
-        sine = np.clip((self.lowest - position[2]) / max(self.radius * up[2], 1e-9), -1.0, 1.0)
-        # from where the ring leaves the ground on one side, over its top, to the other
-        angle = np.linspace(np.arcsin(sine), np.pi - np.arcsin(sine), _RING_SEGMENTS + 1)[:, None, None]
-        around = np.linspace(0.0, 2.0 * np.pi, _WIRE_SEGMENTS, endpoint=False)[None, :, None]
-        out = np.cos(angle) * np.cross(up, normal) + np.sin(angle) * up
-        surface = (self.radius + self.wire * np.cos(around)) * out - self.wire * np.sin(around) * normal
-        return position + surface.reshape(-1, 3), _RING_FACES
+        size = (self.radius, self.wire, self.lowest)
+        return placed_mesh("ring", size, self.position, turn_to_direction(self.normal))
 
 
-Marker = Sphere | Arrow | Box | Capsule | Ring
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A marker or collider as a simulation has placed it.
+
+    Attributes:
+        kind: ``"sphere"``, ``"box"``, ``"capsule"``, ``"ring"`` or ``"arrow"``.
+        vertices: in the world [m], shape ``(V, 3)``.
+        faces: triangles, shape ``(T, 3)``.
+        color: sRGB in [0, 1].
+    """
+
+    kind: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    color: Color
+
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        return self.vertices, self.faces
+
+
+Marker = Sphere | Arrow | Box | Capsule | Ring | Solid
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,61 +215,9 @@ class Camera:
             raise ValueError(f"follow={self.follow} is outside [0, 1]: it is a share of the way in 1/30 s")
 
 
-def _revolve(profile: np.ndarray) -> np.ndarray:
-    """Return vertices of the rings ``(radius, height)`` about the z axis, shape ``(rings * segments, 3)``."""
-    angle = np.linspace(0.0, 2.0 * np.pi, _ARROW_SEGMENTS, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    rings = np.concatenate(
-        [profile[:, None, :1] * circle, np.broadcast_to(profile[:, None, 1:], (len(profile), _ARROW_SEGMENTS, 1))],
-        axis=-1,
-    )
-    return rings.reshape(-1, 3)
-
-
-def _ring_faces(num_rings: int, num_segments: int) -> np.ndarray:
-    """Return outward triangles between consecutive rings that rise along z."""
-    ring, segment = np.meshgrid(np.arange(num_rings - 1), np.arange(num_segments), indexing="ij")
-    following = (segment + 1) % num_segments
-    a, b = ring * num_segments + segment, ring * num_segments + following
-    c, d = a + num_segments, b + num_segments
-    return np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]).astype(
-        np.int32
-    )
-
-
-def _unit_sphere() -> tuple[np.ndarray, np.ndarray]:
-    polar = np.linspace(np.pi, 0.0, _SPHERE_RINGS)
-    angle = np.linspace(0.0, 2.0 * np.pi, _SPHERE_SEGMENTS, endpoint=False)
-    radius, shape = np.sin(polar)[:, None], (_SPHERE_RINGS, _SPHERE_SEGMENTS)
-    vertices = np.stack(
-        [radius * np.cos(angle), radius * np.sin(angle), np.broadcast_to(np.cos(polar)[:, None], shape)], axis=-1
-    )
-    return vertices.reshape(-1, 3), _ring_faces(_SPHERE_RINGS, _SPHERE_SEGMENTS)
-
-
-def _unit_box() -> tuple[np.ndarray, np.ndarray]:
-    """Return six gridded sides that share no vertices, so that edges are sharp and shadows are filled."""
-    line = np.linspace(-1.0, 1.0, _BOX_CELLS + 1)
-    u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
-    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(_BOX_CELLS), np.arange(_BOX_CELLS), indexing="ij"))
-    corner = i * (_BOX_CELLS + 1) + j
-    quad = np.stack([corner, corner + _BOX_CELLS + 1, corner + _BOX_CELLS + 2, corner + 1], axis=-1)
-    vertices, faces = [], []
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            side = np.empty((len(u), 3))
-            side[:, axis], side[:, (axis + 1) % 3], side[:, (axis + 2) % 3] = sign, u, v
-            order = quad if sign > 0.0 else quad[:, ::-1]
-            offset = len(vertices) * len(u)
-            vertices.append(side)
-            faces.append(np.concatenate([order[:, [0, 1, 2]], order[:, [0, 2, 3]]]) + offset)
-    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
-
-
-_UNIT_SPHERE = _unit_sphere()
-_UNIT_BOX = _unit_box()
-_ARROW_FACES = _ring_faces(10, _ARROW_SEGMENTS)
-_RING_FACES = _ring_faces(_RING_SEGMENTS + 1, _WIRE_SEGMENTS)
+def _quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Return the quaternion ``xyzw`` of a matrix ``(3, 3)``."""
+    return Rotation.from_matrix(np.asarray(rotation, np.float64)).as_quat()
 
 
 class Follower:

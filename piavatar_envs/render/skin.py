@@ -1,10 +1,13 @@
-"""Surfaces for pictures: the skin of an avatar, by linear blend skinning plus the particles' displacement, and props.
+"""Drawn surfaces on the device: the skin of an avatar, by linear blend skinning plus displacement of particles; props.
 
 The particles fill the body; the skin mesh is not simulated. Each skin vertex therefore follows its bones, and adds
-the displacement ``x - LBS`` of the particles beneath it. Which particles, and with which weights, is baked once.
+the displacement ``x - LBS`` of the particles beneath it. Which particles, and with which weights, is baked once, on the
+configured shape; where episodes draw shapes, the rest pose of the mesh follows the shape parameters on the device.
 
 A surface may have displacements of its own that depend on the pose. They then stand in place of those that particles
 are skinned with, see :mod:`piavatar_envs.avatar.body.pose_correctives`, which would count the same bulge twice.
+
+Symbols in kernels: ``i`` picture, ``e = envs[i]`` its environment, ``v`` vertex, ``k`` neighbour of a vertex.
 """
 
 from __future__ import annotations
@@ -14,16 +17,26 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from scipy import sparse
+import warp as wp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.interpolation import interpolation_matrix
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, bone_maps, local_rotations
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.correctives import with_joint
+from piavatar_envs.avatar.rotation import rigid_matrix
+from piavatar_envs.avatar.skinning import blend_places, in_order, pack
+from piavatar_envs.core.kernel_cache import init_warp
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.structs import fill
+from piavatar_envs.mpm.types import row
 
 if TYPE_CHECKING:
-    from piavatar_envs.avatar.body.asset import PoseDisplacements
+    from piavatar_envs.avatar.body.asset import AvatarAsset, PoseDisplacements
     from piavatar_envs.avatar.body.pose_correctives import PoseCorrectives
+
+wp.set_module_options({"enable_backward": False})
 
 #: Particles that move a vertex. With few, what neighbours differ by crumples the skin where it is finer than they are:
 #: toes on the ground, between bones that are put into their places and flesh that is not.
@@ -32,6 +45,175 @@ NUM_NEIGHBOURS = 24
 _MOST_BAKED = 8
 #: Particles that move a vertex of a prop.
 _PROP_NEIGHBOURS = 6
+#: Vertices whose displacements by the pose lie side by side: a warp then reads them together, and a CPU from few pages.
+TILE = wp.constant(32)
+
+
+@wp.struct
+class SkinSurface:
+    """Constants of a skin of ``V`` vertices that ``U`` particles move.
+
+    The entries of the correctives of such a particle ``n`` are ``[start[n] : start[n + 1]]``. Where shapes are fixed,
+    ``deltas`` has no rows; where nothing is displaced by the pose, ``directions`` and the correctives have none.
+    """
+
+    rest: wp.array(dtype=wp.vec3)  # (V,) of the shape, or of the mean shape where shapes differ [m]
+    skin: wp.array(dtype=wp.vec4)  # (V,) bones that move a vertex, see piavatar_envs.avatar.skinning
+    near: wp.array2d(dtype=int)  # (K, V) index in ``used`` of the particles that move a vertex
+    weight: wp.array2d(dtype=float)  # (K, V) their weights, which sum to one
+    used: wp.array(dtype=int)  # (U,) particles of the body
+    deltas: wp.array2d(dtype=wp.vec3)  # (2 S, V) displacements at -1 and at +1 of each shape parameter [m]
+    pelvis: wp.array(dtype=wp.vec3)  # (1 + 2 S,) pelvis of the mean shape, and its displacements likewise [m]
+    # (V / TILE, 189 TILE) displacement by elements of the joints' rotation matrices, vertices side by side [m]
+    directions: wp.array2d(dtype=wp.vec3)
+    reference: wp.array(dtype=wp.mat33)  # (bones,) see PoseDisplacements
+    parent: wp.array(dtype=int)  # (bones,)
+    start: wp.array(dtype=int)
+    joint: wp.array(dtype=int)
+    linear: wp.array(dtype=wp.mat33)  # [m]
+    quadratic: wp.array(dtype=wp.mat33)  # [m]
+
+
+@wp.struct
+class SkinMotion:
+    """Bones and particles that move a skin: live arrays of the simulation, of ``num_envs`` or 1 rows."""
+
+    first: int  # index of the body's first particle
+    skin: wp.array(dtype=wp.vec4)  # (P,) bones that move a particle
+    rest: wp.array2d(dtype=wp.vec3)  # (rows, P) rest positions of the particles [m]
+    rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
+    rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) in the world
+    position: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) of the joints [m]
+    x: wp.array2d(dtype=wp.vec3)  # (num_envs, all particles) [m]
+    shape: wp.array2d(dtype=float)  # (num_envs, S) shape parameters; not read where shapes are fixed
+
+
+@wp.struct
+class SkinWorkspace:
+    """Poses of the bones of every picture, and the displacements of the particles that move its skin."""
+
+    place: wp.array2d(dtype=wp.mat44)  # (pictures, bones) from rest to the world
+    local: wp.array2d(dtype=wp.quat)  # (pictures, bones) rotation relative to the parent bone
+    change: wp.array2d(dtype=wp.mat33)  # (pictures, bones) change of that matrix from the reference pose
+    shift: wp.array(dtype=wp.vec3)  # (pictures,) from where the mean shape is to where the body stands [m]
+    displacement: wp.array2d(dtype=wp.vec3)  # (pictures, U) of the particles from where the bones put them [m]
+
+
+@wp.func
+def with_shape(surface: SkinSurface, shape: wp.array2d(dtype=float), e: int, v: int):
+    """Return a vertex of the rest pose in the shape of an environment, where the mean shape is [m]."""
+    rest = surface.rest[v]
+    for s in range(surface.deltas.shape[0] / 2):
+        value = shape[e, s]
+        rest += wp.abs(value) * surface.deltas[2 * s + wp.where(value > 0.0, 1, 0), v]
+    return rest
+
+
+@wp.kernel
+def pose_skin(envs: wp.array(dtype=int), surface: SkinSurface, motion: SkinMotion, workspace: SkinWorkspace):
+    """Write the pose of the bones of every picture, over ``(pictures, bones)``."""
+    i, b = wp.tid()
+    e = envs[i]
+    rest = motion.rest_joint[row(e, motion.rest_joint.shape[0]), b]
+    workspace.place[i, b] = rigid_matrix(motion.rotation[e, b], rest, motion.position[e, b])
+    turn = surface.reference[b]
+    before = turn
+    after = wp.quat_to_matrix(motion.rotation[e, b]) * turn
+    local = motion.rotation[e, b]
+    if b > 0:
+        parent = surface.parent[b]
+        local = wp.quat_inverse(motion.rotation[e, parent]) * local
+        before = wp.transpose(surface.reference[parent]) * before
+        after = wp.transpose(wp.quat_to_matrix(motion.rotation[e, parent]) * surface.reference[parent]) * after
+    workspace.local[i, b] = local
+    workspace.change[i, b] = after - before
+    if b == 0:
+        shift = wp.vec3()
+        if surface.pelvis.shape[0] > 1:
+            pelvis = surface.pelvis[0]
+            for s in range(surface.deltas.shape[0] / 2):
+                value = motion.shape[e, s]
+                pelvis += wp.abs(value) * surface.pelvis[1 + 2 * s + wp.where(value > 0.0, 1, 0)]
+            shift = rest - pelvis
+        workspace.shift[i] = shift
+
+
+@wp.kernel
+def displace_particles(envs: wp.array(dtype=int), surface: SkinSurface, motion: SkinMotion, workspace: SkinWorkspace):
+    """Write how far the particles are from where the bones put them, over ``(pictures, U)``."""
+    i, n = wp.tid()
+    e = envs[i]
+    p = surface.used[n]
+    rest = motion.rest[row(e, motion.rest.shape[0]), p]
+    if surface.start.shape[0] > 1:
+        for c in range(surface.start[n], surface.start[n + 1]):
+            rest = with_joint(rest, surface.linear[c], surface.quadratic[c], workspace.local[i, surface.joint[c]])
+    place = blend_places(workspace.place, i, motion.skin, p, rest)
+    workspace.displacement[i, n] = motion.x[e, motion.first + p] - place
+
+
+@wp.kernel
+def deform_skin(
+    envs: wp.array(dtype=int),
+    surface: SkinSurface,
+    motion: SkinMotion,
+    workspace: SkinWorkspace,
+    first: int,
+    # out
+    vertices: wp.array2d(dtype=wp.vec3),
+):
+    """Write the vertices of a skin, from vertex ``first`` of every picture on; over ``(pictures, V)``."""
+    i, v = wp.tid()
+    rest = with_shape(surface, motion.shape, envs[i], v) + workspace.shift[i]
+    if surface.directions.shape[0] > 0:
+        for b in range(1, surface.parent.shape[0]):
+            change = workspace.change[i, b]
+            for d in range(9):
+                at_change = ((b - 1) * 9 + d) * TILE + v % TILE
+                rest += change[d / 3, d % 3] * surface.directions[v / TILE, at_change]
+    at = blend_places(workspace.place, i, surface.skin, v, rest)
+    for k in range(surface.near.shape[0]):
+        at += surface.weight[k, v] * workspace.displacement[i, surface.near[k, v]]
+    vertices[i, first + v] = at
+
+
+def record_skin(
+    graph: LaunchGraph,
+    envs: wp.array,
+    surface: SkinSurface,
+    motion: SkinMotion,
+    workspace: SkinWorkspace,
+    vertices: wp.array,
+    first: int = 0,
+) -> None:
+    """Append the launches that write a skin into ``vertices``, from vertex ``first`` of every picture on.
+
+    Args:
+        graph: the launch graph to append to.
+        envs: environment of each picture, ``(pictures,)`` int32.
+        surface: from :meth:`Skin.upload`.
+        motion: bones and particles.
+        workspace: from :func:`skin_workspace`, of as many pictures.
+        vertices: of all pictures ``(pictures, ...)`` [m].
+        first: index of the skin's first vertex.
+    """
+    inputs, pictures = [envs, surface, motion, workspace], len(envs)
+    graph.launch(pose_skin, (pictures, NUM_JOINTS), inputs)
+    graph.launch(displace_particles, (pictures, len(surface.used)), inputs)
+    graph.launch(deform_skin, (pictures, len(surface.rest)), [*inputs, first], [vertices])
+
+
+def skin_workspace(surface: SkinSurface, pictures: int, device: str) -> SkinWorkspace:
+    """Allocate what :func:`record_skin` works in."""
+    bones = (pictures, NUM_JOINTS)
+    return fill(
+        SkinWorkspace(),
+        place=wp.zeros(bones, dtype=wp.mat44, device=device),
+        local=wp.zeros(bones, dtype=wp.quat, device=device),
+        change=wp.zeros(bones, dtype=wp.mat33, device=device),
+        shift=wp.zeros(pictures, dtype=wp.vec3, device=device),
+        displacement=wp.zeros((pictures, len(surface.used)), dtype=wp.vec3, device=device),
+    )
 
 
 class SkinnedSurface(Protocol):
@@ -49,7 +231,7 @@ class RestShape(Protocol):
 
 
 class Skin:
-    """Deforms one body's skin mesh with its bones and particles."""
+    """One body's skin mesh, which its bones and particles deform."""
 
     def __init__(
         self,
@@ -79,17 +261,15 @@ class Skin:
                 f"rest_positions, skin_joints and skin_weights have {len(rest_positions)}, {len(skin_joints)} and "
                 f"{len(skin_weights)} rows; give one row a particle, and at least one particle"
             )
-        vertices = np.asarray(body.vertices, dtype=np.float64)
-        particles = np.asarray(rest_positions, dtype=np.float64)
-        self._rest_joints = np.asarray(body.joints, dtype=np.float64)
-        self._vertex_skinning = _skinning_matrix(vertices, asset.skin_joints, asset.skin_weights)
-        self._particle_skinning = _skinning_matrix(particles, skin_joints, skin_weights)
-        own, others = (_joint_weights(asset.skin_joints, asset.skin_weights), _joint_weights(skin_joints, skin_weights))
-        self._interpolation = interpolation_matrix(vertices, own, particles, others, NUM_NEIGHBOURS)
-        self._pose = getattr(asset, "pose", None)
-        self._correctives = correctives
-        if self._pose is not None:
-            self._vertex_weights, self._particle_weights = sparse.csr_array(own), sparse.csr_array(others)
+        self._rest, self._particles = np.asarray(body.vertices, np.float64), np.asarray(rest_positions, np.float64)
+        self._rest_joints = np.asarray(body.joints, np.float64)
+        self._vertex_skin = pack(*in_order(np.asarray(asset.skin_joints), np.asarray(asset.skin_weights)))
+        self._particle_skin = pack(*in_order(np.asarray(skin_joints), np.asarray(skin_weights)))
+        own, others = (dense_weights(asset.skin_joints, asset.skin_weights), dense_weights(skin_joints, skin_weights))
+        self._interpolation = interpolation_matrix(self._rest, own, self._particles, others, NUM_NEIGHBOURS)
+        self._pose: PoseDisplacements | None = getattr(asset, "pose", None)
+        self._correctives = correctives if self._pose is not None else None
+        self._uploaded: dict[tuple[str, int | None], SkinSurface] = {}
 
     @classmethod
     def baked(
@@ -123,11 +303,67 @@ class Skin:
 
     @property
     def num_particles(self) -> int:
-        """Particles that move it."""
+        """Particles of the body."""
         return self._interpolation.shape[1]
 
+    def upload(self, device: str, varying: AvatarAsset | None = None) -> SkinSurface:
+        """Return the constants on a device, uploaded once; where shapes differ, with the shapes of an asset."""
+        key = (device, None if varying is None else id(varying))
+        if key not in self._uploaded:
+            self._uploaded[key] = self._upload(device, varying)
+        return self._uploaded[key]
+
+    def _upload(self, device: str, varying: AvatarAsset | None) -> SkinSurface:
+        count, neighbours = self.num_vertices, self._interpolation.indices.reshape(self.num_vertices, -1)
+        used, near = np.unique(neighbours, return_inverse=True)
+        rest, deltas, pelvis = self._rest, np.zeros((0, count, 3)), np.zeros((1, 3))
+        if varying is not None:
+            drawn = varying.drawn
+            rest, deltas = drawn.vertices, drawn.shape_deltas.reshape(-1, count, 3)
+            pelvis = np.concatenate([varying.joints[:1], varying.shape_joints[:, :, 0].reshape(-1, 3)])
+        directions, reference = np.zeros((0, TILE, 3)), np.tile(np.eye(3), (NUM_JOINTS, 1, 1))
+        if self._pose is not None:
+            elements = self._pose.directions.reshape(count, 3, -1)
+            padded = np.pad(elements, ((0, -count % TILE), (0, 0), (0, 0)))
+            directions = padded.reshape(-1, TILE, *elements.shape[1:]).transpose(0, 3, 1, 2)
+            directions, reference = directions.reshape(len(directions), -1, 3), self._pose.reference
+
+        def array(values: np.ndarray, dtype: type) -> wp.array:
+            scalar = np.int32 if dtype is int else np.float32
+            return wp.array(np.ascontiguousarray(values, scalar), dtype=dtype, device=device)
+
+        return fill(
+            SkinSurface(),
+            rest=array(rest, wp.vec3),
+            skin=array(self._vertex_skin, wp.vec4),
+            near=array(near.reshape(neighbours.shape).T, int),
+            weight=array(self._interpolation.data.reshape(neighbours.shape).T, float),
+            used=array(used, int),
+            deltas=array(deltas, wp.vec3),
+            pelvis=array(pelvis, wp.vec3),
+            directions=array(directions, wp.vec3),
+            reference=array(reference, wp.mat33),
+            parent=array(np.array(PARENTS), int),
+            **{name: array(values, dtype) for name, values, dtype in self._correctives_of(used)},
+        )
+
+    def _correctives_of(self, used: np.ndarray) -> tuple[tuple[str, np.ndarray, type], ...]:
+        """Return the correctives of some particles: name, values and type of each array."""
+        none = np.zeros((0, 3, 3))
+        start, joint, linear, quadratic = np.zeros(1), np.zeros(0), none, none
+        if self._correctives is not None:
+            own = self._correctives
+            counts = np.diff(own.start)[used]
+            start = np.concatenate([[0], np.cumsum(counts)])
+            entries = np.repeat(own.start[used] - start[:-1], counts) + np.arange(start[-1])
+            joint, linear, quadratic = (getattr(own, name)[entries] for name in ("joint", "linear", "quadratic"))
+        return (
+            ("start", start, int), ("joint", joint, int), ("linear", linear, wp.mat33),
+            ("quadratic", quadratic, wp.mat33),
+        )  # fmt: skip
+
     def deform(self, rotations: np.ndarray, positions: np.ndarray, particle_positions: np.ndarray) -> np.ndarray:
-        """Compute the skin vertices of one simulated state.
+        """Compute the skin vertices of one state, on the CPU.
 
         Args:
             rotations: world rotations of the bones, identity in the rest pose, shape ``(22, 3, 3)``.
@@ -140,62 +376,84 @@ class Skin:
         Raises:
             ValueError: another number of particles than were baked.
         """
-        particle_positions = np.asarray(particle_positions, dtype=np.float64)
-        if particle_positions.shape != (self.num_particles, 3):
-            raise ValueError(f"particle_positions has shape {particle_positions.shape}, not ({self.num_particles}, 3)")
-        transforms = self._transforms(rotations, positions)
-        displacement = particle_positions - self._particle_skinning @ transforms
-        vertices = self._vertex_skinning @ transforms
-        if self._pose is not None:
-            rotations = np.asarray(rotations, dtype=np.float64)
-            vertices += _turned(self._vertex_weights, rotations, self._pose.displacement(rotations))
-            if self._correctives is not None:
-                local = Rotation.from_matrix(local_rotations(rotations))
-                own = self._correctives.displacement(local.as_quat())
-                displacement -= _turned(self._particle_weights, rotations, own)
-        return (vertices + self._interpolation @ displacement).astype(np.float32)
+        if np.shape(particle_positions) != (self.num_particles, 3):
+            raise ValueError(
+                f"particle_positions has shape {np.shape(particle_positions)}, not ({self.num_particles}, 3)"
+            )
+
+        def array(values: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(np.ascontiguousarray(values, np.float32), dtype=dtype, device="cpu")
+
+        init_warp()
+        quaternions = Rotation.from_matrix(rotations).as_quat()
+        motion = fill(
+            SkinMotion(),
+            first=0,
+            skin=array(self._particle_skin, wp.vec4),
+            rest=array(self._particles[None], wp.vec3),
+            rest_joint=array(self._rest_joints[None], wp.vec3),
+            rotation=array(quaternions[None], wp.quat),
+            position=array(np.asarray(positions)[None], wp.vec3),
+            x=array(np.asarray(particle_positions)[None], wp.vec3),
+            shape=wp.zeros((1, 1), dtype=float, device="cpu"),
+        )
+        surface, envs = self.upload("cpu"), wp.zeros(1, dtype=int, device="cpu")
+        vertices = wp.zeros((1, self.num_vertices), dtype=wp.vec3, device="cpu")
+        graph = LaunchGraph("cpu")
+        record_skin(graph, envs, surface, motion, skin_workspace(surface, 1, "cpu"), vertices)
+        graph.run_eager()
+        return vertices.numpy()[0]
 
     def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
         """Interpolate a quantity of the particles on the skin, shape ``(P, ...)`` to ``(V, ...)``."""
         return self._interpolation @ np.asarray(per_particle, dtype=np.float64)
-
-    def _transforms(self, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Return rest-to-world transforms stacked for the skinning matrices, shape ``(88, 3)``."""
-        rotations, positions = (np.asarray(values, dtype=np.float64) for values in (rotations, positions))
-        maps = bone_maps(rotations, positions, self._rest_joints)
-        return maps.transpose(0, 2, 1).reshape(4 * NUM_JOINTS, 3)
 
 
 #: Skins by the digest of what they were baked from, the one that was used last at the end.
 _baked: OrderedDict[bytes, Skin] = OrderedDict()
 
 
-def _skinning_matrix(points: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> sparse.csr_array:
-    """Build linear blend skinning as one sparse matrix: rows ``w_b (x, y, z, 1)``, shape ``(N, 88)``."""
-    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    joints = np.asarray(joints, dtype=np.int64)
-    values = np.asarray(weights, dtype=np.float64)[:, :, None] * homogeneous[:, None, :]
-    columns = 4 * joints[:, :, None] + np.arange(4)
-    rows = np.broadcast_to(np.arange(len(points))[:, None, None], columns.shape)
-    matrix = sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(len(points), 4 * NUM_JOINTS))
-    matrix.eliminate_zeros()
-    return matrix
+@wp.struct
+class PropSurface:
+    """Constants of a prop's surface of ``V`` vertices."""
+
+    vertices: wp.array(dtype=wp.vec3)  # (V,) in the rest frame [m]
+    near: wp.array2d(dtype=int)  # (K, V) particles that move a vertex
+    weight: wp.array2d(dtype=float)  # (K, V) their weights, which sum to one
+    rest: wp.array(dtype=wp.vec3)  # (P,) particles in the rest frame [m]
 
 
-def _turned(weights: sparse.csr_array, rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return vectors of points ``(N, 3)`` turned as their skinning turns them."""
-    return np.einsum("nij,nj->ni", (weights @ rotations.reshape(NUM_JOINTS, 9)).reshape(-1, 3, 3), vectors)
-
-
-def _joint_weights(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return skinning weights as one dense row a point, shape ``(N, 22)``."""
-    dense = np.zeros((len(joints), NUM_JOINTS))
-    np.add.at(dense, (np.arange(len(joints))[:, None], np.asarray(joints, dtype=np.int64)), weights)
-    return dense
+@wp.kernel
+def deform_prop(
+    envs: wp.array(dtype=int),
+    surface: PropSurface,
+    first_particle: int,
+    column: int,
+    position: wp.array2d(dtype=wp.vec3),
+    rotation: wp.array2d(dtype=wp.quat),
+    x: wp.array2d(dtype=wp.vec3),
+    first: int,
+    # out
+    vertices: wp.array2d(dtype=wp.vec3),
+):
+    """Write the surface of the prop in a ``column``, from vertex ``first`` of every picture on; ``(pictures, V)``."""
+    i, v = wp.tid()
+    e = envs[i]
+    center = position[e, column]
+    turn = wp.quat_to_matrix(rotation[e, column])
+    at = turn * surface.vertices[v] + center
+    for k in range(surface.near.shape[0]):
+        p = surface.near[k, v]
+        at += surface.weight[k, v] * (x[e, first_particle + p] - (turn * surface.rest[p] + center))
+    vertices[i, first + v] = at
 
 
 class SolidSurface:
-    """Deforms the surface mesh of one prop with its particles."""
+    """Surface mesh of one prop, which its particles deform.
+
+    Attributes:
+        faces: its triangles, shape ``(T, 3)`` int32.
+    """
 
     def __init__(self, rest: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> None:
         """Bake the weights: a vertex moves with its nearest particles, the nearer the more.
@@ -207,17 +465,22 @@ class SolidSurface:
         """
         self.vertices, self.faces = np.asarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)
         self._rest = np.asarray(rest, np.float64)
-        distance, self._near = cKDTree(self._rest).query(self.vertices, k=min(_PROP_NEIGHBOURS, len(rest)))
+        near = np.arange(1, 1 + min(_PROP_NEIGHBOURS, len(rest)))
+        distance, self._near = cKDTree(self._rest).query(self.vertices, k=near)
         weight = 1.0 / np.maximum(distance, 1e-6) ** 2
         self._weight = weight / weight.sum(axis=1, keepdims=True)
 
-    def deform(self, rotation: np.ndarray, position: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Return world vertices [m], shape ``(V, 3)``.
+    def upload(self, device: str) -> PropSurface:
+        """Return the constants on a device."""
 
-        Args:
-            rotation: rest frame to world, shape ``(3, 3)``.
-            position: centre of mass [m].
-            x: particles in the world [m], shape ``(P, 3)``.
-        """
-        dent = x - (self._rest @ rotation.T + position)
-        return self.vertices @ rotation.T + position + (self._weight[..., None] * dent[self._near]).sum(1)
+        def array(values: np.ndarray, dtype: type) -> wp.array:
+            scalar = np.int32 if dtype is int else np.float32
+            return wp.array(np.ascontiguousarray(values, scalar), dtype=dtype, device=device)
+
+        return fill(
+            PropSurface(),
+            vertices=array(self.vertices, wp.vec3),
+            near=array(self._near.T, int),
+            weight=array(self._weight.T, float),
+            rest=array(self._rest, wp.vec3),
+        )

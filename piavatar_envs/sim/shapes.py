@@ -245,6 +245,10 @@ class Shapes:
                 **shape,
             )
 
+    def parameters(self, avatar: int) -> wp.array:
+        """Return the shape parameters of an avatar in every environment, ``(num_envs, S)``, where shapes are random."""
+        return self._parameters[avatar]
+
     def drawn(self, avatar: int) -> dict[str, tuple[Parameter, wp.array]]:
         """Return the drawn parameters of an avatar's shape by name, with their values in every environment."""
         names = self._names

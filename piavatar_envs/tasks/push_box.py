@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -23,6 +23,7 @@ from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.colliders import BOX, solid_distance
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.markers import WIRE, Markers, MarkerSpec
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.hands import write_hands
@@ -30,9 +31,6 @@ from piavatar_envs.tasks.common.ranges import DistanceRange, Margin, MassRange, 
 from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
 from piavatar_envs.tasks.common.root_command import record_root_clamp
 from piavatar_envs.tasks.common.spawn import forward_of, record_standing
-
-if TYPE_CHECKING:
-    from piavatar_envs.render.scene import Marker
 
 wp.set_module_options({"enable_backward": False})
 
@@ -213,6 +211,17 @@ def observe_lead(
     write_vector(observation, e, agent, start, wp.vec3(lead[0], lead[1], turn[2]))
 
 
+@wp.kernel
+def place_target(
+    target: wp.array(dtype=wp.vec3),
+    # out
+    markers: Markers,
+):
+    """Place the marker of the target just above the ground."""
+    e = wp.tid()
+    markers.position[e, 0] = target[e] + wp.vec3(0.0, 0.0, 0.01)
+
+
 class PushBoxTask(Task):
     """Push the box to the target."""
 
@@ -363,11 +372,11 @@ each action the command is clamped to within 0.1 m and 0.3 rad of the body."""
         inputs = [bones, state.command_rotation, state.command_root, agent, last]
         graph.launch(observe_lead, env.num_envs, inputs, [env.observation])
 
-    def markers(self, env, index: int) -> list[Marker]:
-        from piavatar_envs.render.scene import Ring
+    def marker_specs(self) -> tuple[MarkerSpec, ...]:
+        return (MarkerSpec("ring", (self.config.target_radius, WIRE)),)
 
-        at = self.target.numpy()[index] + np.float32([0.0, 0.0, 0.01])
-        return [Ring(at, np.array([0.0, 0.0, 1.0]), self.config.target_radius)]
+    def record_markers(self, env, graph, markers) -> None:
+        graph.launch(place_target, env.num_envs, [self.target], [markers])
 
 
 TASK = PushBoxTask

@@ -15,6 +15,7 @@ from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of, rest_joint, write_in_root
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
+from piavatar_envs.sim.markers import Markers, MarkerSpec
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.tasks.common.hands import LEFT_WRIST, RIGHT_WRIST, flesh_middle
 from piavatar_envs.tasks.common.ranges import Margin, Weight
@@ -69,7 +70,6 @@ class Swing:
 
     course: wp.array(dtype=wp.vec4)  # parameters COURSE
     phase: wp.array(dtype=wp.vec2)  # parameters PHASE
-    goal: wp.array(dtype=wp.vec3)  # the target's present position [m]
 
 
 @wp.kernel
@@ -138,11 +138,24 @@ def observe(
     time = target.control_dt * float(episodes.step_count[e])
     here = goal_at(target, swing, bones, e, time)
     later = goal_at(target, swing, bones, e, time + target.control_dt)
-    swing.goal[e] = here
     write_in_root(observation, e, agent, start, bones, here - bones.position[e, 0])
     write_in_root(observation, e, agent, start + 3, bones, (later - here) / target.control_dt)
     write_in_root(observation, e, agent, start + 6, bones, here - flesh_middle(bones, e, LEFT_WRIST))
     write_in_root(observation, e, agent, start + 9, bones, here - flesh_middle(bones, e, RIGHT_WRIST))
+
+
+@wp.kernel
+def place_target(
+    target: Target,
+    swing: Swing,
+    bones: Bones,
+    episodes: Episodes,
+    # out
+    markers: Markers,
+):
+    """Place the marker of the target."""
+    e = wp.tid()
+    markers.position[e, 0] = goal_at(target, swing, bones, e, target.control_dt * float(episodes.step_count[e]))
 
 
 class ReachTask(Task):
@@ -166,7 +179,6 @@ class ReachTask(Task):
         Metric("right_distance", "m", "from the middle of the right hand to the target"),
     )
     state_arrays = (TaskArray("course", wp.vec4, drawn=COURSE), TaskArray("phase", wp.vec2, drawn=PHASE))
-    scratch_arrays = (TaskArray("goal", wp.vec3),)
 
     summary = """A target swings on a sphere of `radius` about the chest, in front of the body or beside it, at up to
 0.7 of `target_speed`. The avatar stands upright, its joints slightly bent at random (`pose_noise`). A good agent moves
@@ -191,8 +203,11 @@ the middle of either hand to the target and keeps it there."""
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         graph.launch(observe, env.num_envs, [*self.inputs, agent, start], [env.observation])
 
-    def markers(self, env, index: int) -> list:
-        return [(self.goal.numpy()[index].copy(), self.config.target_radius, (0.95, 0.35, 0.2))]
+    def marker_specs(self) -> tuple[MarkerSpec, ...]:
+        return (MarkerSpec("sphere", (self.config.target_radius,), (0.95, 0.35, 0.2)),)
+
+    def record_markers(self, env, graph, markers) -> None:
+        graph.launch(place_target, env.num_envs, self.inputs, [markers])
 
 
 TASK = ReachTask

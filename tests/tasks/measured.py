@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.api.pictures import SceneReader, camera_of
 from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.sim.markers import Markers, allocate_markers
 
 
 def still(env) -> np.ndarray:
@@ -24,6 +26,15 @@ def seen(env, observation, name: str) -> np.ndarray:
 def tolerance(value: float, bound: float, margin: float) -> float:
     """Return dm_control's Gaussian tolerance: 1 within the bound, a tenth at the margin beyond it."""
     return 10.0 ** -((max(value - bound, 0.0) / margin) ** 2)
+
+
+def markers_of(batch) -> Markers:
+    """Return where the task's markers are now, in all environments."""
+    markers = allocate_markers(batch.task.marker_specs(), batch.num_envs, batch.device)
+    graph = LaunchGraph(batch.device)
+    batch.task.record_markers(batch, graph, markers)
+    graph.run()
+    return markers
 
 
 def joints(env) -> np.ndarray:

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset, register_source
@@ -18,7 +19,17 @@ from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.common.ball_goal import Course, Gate, closest_pass, draw_gate, passes
 from piavatar_envs.tasks.header import HEAD_RADIUS, TOUCH_HEIGHT
 from tests.conftest import reward_terms
-from tests.tasks.measured import joints, middle, pelvis, prop_motion, prop_particles, seen, still, tolerance
+from tests.tasks.measured import (
+    joints,
+    markers_of,
+    middle,
+    pelvis,
+    prop_motion,
+    prop_particles,
+    seen,
+    still,
+    tolerance,
+)
 
 KICK, HEADER = "PIAvatar/KickBall-v0", "PIAvatar/Header-v0"
 FEET = ("left_foot", "right_foot")
@@ -251,9 +262,11 @@ def put_ball(env, position, velocity) -> None:
 
 def gate_of(env) -> tuple[np.ndarray, np.ndarray]:
     """Centre and normal of the gate as it is drawn."""
-    (ring,) = env.batch.task.markers(env.batch, 0)
-    assert ring.radius == env.config.target_radius
-    return ring.position.astype(float), ring.normal.astype(float)
+    (spec,) = env.batch.task.marker_specs()
+    assert spec.kind == "ring" and spec.size[0] == env.config.target_radius
+    markers = markers_of(env.batch)
+    turn = Rotation.from_quat(markers.rotation.numpy()[0, 0].astype(float))
+    return markers.position.numpy()[0, 0].astype(float), turn.apply([0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("task", [KICK, HEADER])

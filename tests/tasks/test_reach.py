@@ -7,16 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
-from tests.tasks.measured import middle, pelvis, still, tolerance
+from tests.tasks.measured import markers_of, middle, pelvis, still, tolerance
 
 REACH = "PIAvatar/Reach-v0"
 
 
 def target(env) -> np.ndarray:
     """Position of the target in the world [m], as it is drawn."""
-    (position, radius, _), *rest = env.batch.task.markers(env.batch, 0)
-    assert not rest and radius == env.config.target_radius
-    return position.astype(float)
+    (spec,) = env.batch.task.marker_specs()
+    assert spec.kind == "sphere" and spec.size == (env.config.target_radius,)
+    return markers_of(env.batch).position.numpy()[0, 0].astype(float)
 
 
 def hands(env) -> np.ndarray:

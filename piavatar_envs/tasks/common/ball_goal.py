@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import warp as wp
 from pydantic import Field
@@ -20,14 +20,12 @@ from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.markers import WIRE, Markers, MarkerSpec, turn_to
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.ranges import DistanceRange, MassRange, Weight, check_ranges
 from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
 from piavatar_envs.tasks.common.spawn import record_standing
-
-if TYPE_CHECKING:
-    from piavatar_envs.render.scene import Ring
 
 wp.set_module_options({"enable_backward": False})
 
@@ -293,6 +291,18 @@ class GateConfig(EnvConfig):
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 
+@wp.kernel
+def place_gate(
+    course: Course,
+    # out
+    markers: Markers,
+):
+    """Place the marker of the gate."""
+    e = wp.tid()
+    markers.position[e, 0] = course.center[e]
+    markers.rotation[e, 0] = turn_to(course.forward[e])
+
+
 class GateTask(Task):
     """Base of tasks that send a ball through a gate.
 
@@ -440,9 +450,9 @@ class GateTask(Task):
         graph.launch(observe_gate, env.num_envs, inputs, [env.observation])
         return start + _OWN_TERMS
 
-    def markers(self, env, index: int) -> list[Ring]:
-        """Return the gate of environment ``index`` as a ring; pictures show the part above the ground."""
-        from piavatar_envs.render.scene import Ring
+    def marker_specs(self) -> tuple[MarkerSpec, ...]:
+        """Return the gate as a ring; pictures show the part above the ground."""
+        return (MarkerSpec("ring", (self.config.target_radius, WIRE)),)
 
-        center, forward = (array.numpy()[index].copy() for array in (self.center, self.forward))
-        return [Ring(center, forward, self.config.target_radius)]
+    def record_markers(self, env, graph, markers) -> None:
+        graph.launch(place_gate, env.num_envs, [self.course], [markers])

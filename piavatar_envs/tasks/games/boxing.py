@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
 from pydantic import Field
 
@@ -17,6 +16,7 @@ from piavatar_envs.envs.episodes import Episodes, Outcome
 from piavatar_envs.envs.framing import Sphere
 from piavatar_envs.envs.task import Metric, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.markers import MarkerSpec
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.common.multi_agent import (
@@ -279,10 +279,11 @@ for it to stay up. A good agent strikes fast, at the head, and withdraws."""
         inputs = [self.rules, self.impulse, self.points, self.score, self.referee.out, env.episodes, env.action]
         graph.launch(judge, agents, inputs, [env.outcome])
 
-    def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
+    def marker_specs(self) -> tuple[MarkerSpec, ...]:
+        """Return the posts of the ring, each a column of balls."""
         side = 0.5 * self.config.ring_size
         corners = [(x, y, z) for x in (-side, side) for y in (-side, side) for z in POSTS]
-        return [(np.array(corner), MARKER, (0.75, 0.20, 0.20)) for corner in corners]
+        return tuple(MarkerSpec("sphere", (MARKER,), (0.75, 0.20, 0.20), corner) for corner in corners)
 
 
 TASK = BoxingTask

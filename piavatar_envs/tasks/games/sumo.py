@@ -17,6 +17,7 @@ from piavatar_envs.envs.framing import Sphere
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Metric, Term
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.markers import MarkerSpec
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.common.multi_agent import (
@@ -207,10 +208,11 @@ does not lose its balance."""
         inputs = [self.config.ring_radius, env.bones[agent], agent, start + RING_CENTRE.size]
         graph.launch(observe_rim, env.num_envs, inputs, [env.observation])
 
-    def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
+    def marker_specs(self) -> tuple[MarkerSpec, ...]:
+        """Return the rim of the ring, as balls."""
         turns = 2.0 * np.pi * np.arange(RIM_MARKERS) / RIM_MARKERS
         rim = self.config.ring_radius * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=-1)
-        return [(at, MARKER, (0.85, 0.65, 0.30)) for at in rim]
+        return tuple(MarkerSpec("sphere", (MARKER,), (0.85, 0.65, 0.30), tuple(at)) for at in rim.tolist())
 
 
 TASK = SumoTask

@@ -1,0 +1,203 @@
+"""The stage: all surfaces of a simulation, computed on its device for any number of its environments.
+
+What stands there never changes: avatars, soft props, the scene's colliders, then the task's markers. Only vertices do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.structs import fill
+from piavatar_envs.render.markers import MarkerMeshes, place_markers, unit_mesh, upload_meshes
+from piavatar_envs.render.scene import PALETTE, PROP, Color
+from piavatar_envs.render.skin import (
+    Skin,
+    SkinMotion,
+    SolidSurface,
+    deform_prop,
+    record_skin,
+    skin_workspace,
+)
+from piavatar_envs.render.surfaces import MeshPart, Surfaces
+from piavatar_envs.sim.markers import Markers, MarkerSpec, allocate_markers
+from piavatar_envs.sim.world import Simulation
+
+#: Kinds of colliders that are drawn; planes are not.
+_DRAWN_COLLIDERS = ("sphere", "box", "capsule")
+#: The name of the markers among the subjects.
+MARKERS = "markers"
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One mesh on the stage.
+
+    Attributes:
+        name: of the avatar, prop or collider; :data:`MARKERS` of a marker.
+        kind: ``"avatar"``, ``"prop"``, or the kind of the collider or marker.
+        vertices: which of the stage's are its own.
+        faces: triangles, counted from its first vertex, shape ``(T, 3)`` int32.
+        color: sRGB in [0, 1].
+        colors: sRGB of the vertices instead, shape ``(V, 3)`` uint8.
+        subject: its label, an index into :attr:`Stage.subjects`.
+    """
+
+    name: str
+    kind: str
+    vertices: slice
+    faces: np.ndarray
+    color: Color
+    colors: np.ndarray | None
+    subject: int
+
+    @property
+    def num_vertices(self) -> int:
+        """Return the number of its vertices."""
+        return self.vertices.stop - self.vertices.start
+
+
+class Stage:
+    """Surfaces of a simulation in the environments of some pictures.
+
+    A task whose markers move writes :attr:`markers` before the stage is recorded::
+
+        stage = Stage(simulation, task.marker_specs())
+        task.record_markers(env, graph, stage.markers)
+        stage.record(graph)
+
+    Attributes:
+        num_pictures: number of pictures, the first dimension of :attr:`vertices`.
+        envs: environment of each picture, ``(num_pictures,)`` int32.
+        parts: what stands there, in the order of the vertices.
+        subjects: names by label: the ground, avatars, props, colliders, and all markers together.
+        skins: the skin of every avatar.
+        vertices: in the world [m], ``(num_pictures, vertices)``; NaN of a marker that is hidden.
+        markers: of all environments, where they are; written by the task.
+    """
+
+    def __init__(
+        self, simulation: Simulation, markers: Sequence[MarkerSpec] = (), envs: Sequence[int] | None = None
+    ) -> None:
+        """Bake the surfaces, which takes a second for a body that this process has not drawn yet.
+
+        Args:
+            simulation: the simulated world.
+            markers: what the task shows besides.
+            envs: environments to show, one a picture; all if not given.
+        """
+        self.simulation, self.device = simulation, simulation.device
+        chosen = np.arange(simulation.num_envs) if envs is None else np.asarray(envs)
+        self.num_pictures = len(chosen)
+        self.envs = wp.array(chosen.astype(np.int32), dtype=int, device=self.device)
+        self.parts: list[Part] = []
+        names = simulation.subjects.names
+        boundaries = simulation.subjects.colliders[: len(simulation.subjects.collider_names)]
+        self._colliders = [i for i, solid in enumerate(boundaries) if solid.kind in _DRAWN_COLLIDERS]
+        solids = tuple(simulation.subjects.collider_names[i] for i in self._colliders)
+        self.subjects = ("ground", *names, *solids, *([MARKERS] if markers else []))
+        self.skins = [self._bake(index) for index in range(len(simulation.avatars))]
+        self._solids = [SolidSurface(own.rest, own.vertices, own.faces) for own in simulation.props.points]
+        self._list_parts(names, markers)
+        count = self.parts[-1].vertices.stop if self.parts else 0
+        self.vertices = wp.zeros((self.num_pictures, count), dtype=wp.vec3, device=self.device)
+        self.markers = allocate_markers(markers, simulation.num_envs, self.device)
+        self._specs = tuple(markers)
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        """The surfaces for a painter, on the device: one colouring for all pictures."""
+        meshes = [MeshPart(p.num_vertices, p.faces, p.color, p.colors, subject=p.subject) for p in self.parts]
+        return Surfaces.build(meshes, self.device)
+
+    def select(self, envs: Sequence[int]) -> None:
+        """Show these environments from now on, as many as there are pictures."""
+        self.envs.assign(np.asarray(envs, np.int32))
+
+    def _bake(self, avatar: int) -> Skin:
+        """Return the skin of an avatar, with the weights of its configured shape."""
+        flesh = self.simulation.flesh[avatar]
+        points, _ = flesh.shaped(flesh.base_parameters)
+        body = flesh.asset.shape_drawn(flesh.base_parameters)
+        skinning = points.rest[0], points.skin_joints, points.skin_weights
+        return Skin.baked(flesh.asset.drawn, body, *skinning, points.correctives)
+
+    def _list_parts(self, names: Sequence[str], markers: Sequence[MarkerSpec]) -> None:
+        """Lay the meshes of all parts one after the other."""
+        simulation, avatars = self.simulation, len(self.simulation.avatars)
+        for index, flesh in enumerate(simulation.flesh):
+            drawn = flesh.asset.drawn
+            color = PALETTE[index % len(PALETTE)]
+            self._add(names[index], "avatar", len(drawn.vertices), drawn.faces, color, drawn.colors_of(index))
+        for name, solid in zip(names[avatars:], self._solids, strict=True):
+            self._add(name, "prop", len(solid.vertices), solid.faces, PROP)
+        for collider in self._colliders:
+            kind, name = simulation.subjects.colliders[collider].kind, simulation.subjects.collider_names[collider]
+            local, faces = unit_mesh(kind)
+            self._add(name, kind, len(local), faces, PROP)
+        for spec in markers:
+            local, faces = unit_mesh(spec.kind)
+            self._add(MARKERS, spec.kind, len(local), faces, spec.color)
+
+    def _add(
+        self, name: str, kind: str, count: int, faces: np.ndarray, color: Color, colors: np.ndarray | None = None
+    ) -> None:
+        """Append a part."""
+        first = self.parts[-1].vertices.stop if self.parts else 0
+        subject = self.subjects.index(name, 1)
+        self.parts.append(Part(name, kind, slice(first, first + count), faces, color, colors, subject))
+
+    def record(self, graph: LaunchGraph) -> None:
+        """Append the launches that write the vertices of all pictures from the present state."""
+        first = iter([part.vertices.start for part in self.parts])
+        for avatar in range(len(self.skins)):
+            self._record_skin(graph, avatar, next(first))
+        props, x = self.simulation.props, self.simulation.state.x
+        for column, (prop, solid) in enumerate(zip(props.props, self._solids, strict=True)):
+            inputs = [self.envs, solid.upload(self.device), prop.first, column, props.state.position]
+            inputs += [props.state.rotation, x, next(first)]
+            graph.launch(deform_prop, (self.num_pictures, len(solid.vertices)), inputs, [self.vertices])
+        if self._colliders:
+            solids = [self.simulation.subjects.colliders[i] for i in self._colliders]
+            meshes = upload_meshes([s.kind for s in solids], [s.size for s in solids], self.device, self._colliders)
+            self._record_solids(graph, meshes, self._placed_colliders(), next(first))
+        if self._specs:
+            meshes = upload_meshes([s.kind for s in self._specs], [s.size for s in self._specs], self.device)
+            self._record_solids(graph, meshes, self.markers, self.parts[-len(self._specs)].vertices.start)
+
+    def _record_skin(self, graph: LaunchGraph, index: int, first: int) -> None:
+        """Append the skin of an avatar."""
+        simulation, avatar, flesh = self.simulation, self.simulation.avatars[index], self.simulation.flesh[index]
+        varies = flesh.shape.randomize
+        surface = self.skins[index].upload(self.device, flesh.asset if varies else None)
+        motion = fill(
+            SkinMotion(),
+            avatar.body,
+            avatar.tracked,
+            x=simulation.state.x,
+            shape=simulation.shapes.parameters(index) if varies else wp.zeros((1, 1), dtype=float, device=self.device),
+        )
+        workspace = skin_workspace(surface, self.num_pictures, self.device)
+        record_skin(graph, self.envs, surface, motion, workspace, self.vertices, first)
+
+    def _placed_colliders(self) -> Markers:
+        """Return the live arrays of all colliders, as markers."""
+        boundaries = self.simulation.model.boundaries
+        shape = (1, boundaries.position.shape[1])
+        return fill(
+            Markers(),
+            position=boundaries.position,
+            rotation=boundaries.rotation,
+            scale=wp.ones(shape, dtype=float, device=self.device),
+            visible=wp.array(np.ones(shape, bool), dtype=wp.bool, device=self.device),
+        )
+
+    def _record_solids(self, graph: LaunchGraph, meshes: MarkerMeshes, placed: Markers, first: int) -> None:
+        """Append the launch that places the meshes of colliders or markers."""
+        shape = (self.num_pictures, len(meshes.local))
+        graph.launch(place_markers, shape, [self.envs, meshes, placed, first], [self.vertices])
