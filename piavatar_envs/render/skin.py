@@ -306,6 +306,12 @@ class Skin:
         """Particles of the body."""
         return self._interpolation.shape[1]
 
+    @property
+    def stencil(self) -> tuple[np.ndarray, np.ndarray]:
+        """Particles of the body that move each vertex, and their weights, both shape ``(V, K)``."""
+        shape = (self.num_vertices, -1)
+        return self._interpolation.indices.reshape(shape), self._interpolation.data.reshape(shape)
+
     def upload(self, device: str, varying: AvatarAsset | None = None) -> SkinSurface:
         """Return the constants on a device, uploaded once; where shapes differ, with the shapes of an asset."""
         key = (device, None if varying is None else id(varying))
