@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from piavatar_envs.render.coloring import color_by
-from piavatar_envs.render.scene import Body, Marker, Scene
+from piavatar_envs.render.scene import Body, Marker, Scene, Solid
 
 
 @dataclass(eq=False)
@@ -121,7 +121,8 @@ def _meshes(scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndar
         yield f"body_{index}", body.vertices, body.faces, _colors_of(body)
     for index, marker in enumerate(scene.markers):
         vertices, faces = marker.mesh()
-        yield f"{type(marker).__name__.lower()}_{index}", vertices, faces, _colors_of(marker, len(vertices))
+        kind = marker.kind if isinstance(marker, Solid) else type(marker).__name__.lower()
+        yield f"{kind}_{index}", vertices, faces, _colors_of(marker, len(vertices))
 
 
 def _colors_of(thing: Body | Marker, count: int = 0) -> np.ndarray:

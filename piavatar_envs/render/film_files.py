@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from piavatar_envs.avatar.body.splat_files import write_ply
 from piavatar_envs.core.extras import missing
 from piavatar_envs.render.coloring import srgb_to_linear
 from piavatar_envs.render.film import Film, Moving, Names
@@ -244,10 +245,13 @@ class PlyWriter:
         """
         for name, vertices, faces, colors in self._names.meshes(scene):
             write_mesh_ply(self._file(name), vertices, faces, colors)
+        for index, body in enumerate(scene.bodies):
+            if body.splats is not None:
+                write_ply(self._file(f"splats_{index}"), body.splats.as_cloud())
         self._num_frames += 1
 
     def finish(self) -> list[Path]:
-        """Return the folders of the meshes."""
+        """Return the folders of the meshes and of the splats."""
         return list(self._folders.values())
 
     def _file(self, name: str) -> Path:

@@ -170,6 +170,7 @@ def draw_triangles(
     large: int,
     views: wp.array[View],
     triangles: wp.array[wp.vec3i],
+    subject: wp.array[int],  # -1 of triangles that are not drawn
     vertices: wp.array2d[wp.vec3],  # [m], (N, V)
     areas: wp.array2d[wp.vec3],  # outward normals times area, zero where hidden, (C, T)
     # in, out
@@ -189,7 +190,7 @@ def draw_triangles(
         p = wp.vec3()
         q = wp.vec3()
         r = wp.vec3()
-        if wp.dot(areas[c, t], view.eye - a) > 0.0:
+        if wp.dot(areas[c, t], view.eye - a) > 0.0 and subject[t] >= 0:
             p = to_camera(view, a)
             q = to_camera(view, vertices[n, corner[1]])
             r = to_camera(view, vertices[n, corner[2]])
@@ -277,7 +278,7 @@ class Raster:
         graph.launch(
             draw_triangles,
             (count, k),
-            [first, k, self._samples, large, views, triangles, vertices, areas],
+            [first, k, self._samples, large, views, triangles, self._surfaces.subject, vertices, areas],
             [self.nearest, self.num_large, self._large],
         )
         if self._shares:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from types import TracebackType
 
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.body.splats import SplatCloud, joined_colors
 from piavatar_envs.core.capture_lock import CAPTURE
 from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render.coloring import srgb_to_linear, strain_color, strain_table
 from piavatar_envs.render.overlay import draw_scale
 from piavatar_envs.render.painter import GREATEST_SIDE, Painter
-from piavatar_envs.render.scene import Body, Camera, Follower, Marker
+from piavatar_envs.render.scene import Body, Camera, Follower, Marker, MovedSplats
+from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces, linear_albedo
 from piavatar_envs.render.views import Shot, view_rows
 
@@ -97,15 +100,17 @@ class Renderer:
                 for marker, mesh in zip(markers, meshes[len(bodies) :], strict=True)
             ]
         )
-        key = tuple((id(faces), len(own)) for own, faces in meshes)
+        splats = [body.splats for body in bodies if body.splats is not None]
+        key = (tuple((id(faces), len(own)) for own, faces in meshes), tuple(id(each.cloud) for each in splats))
         if self._shown is None or self._shown.key != key:
-            faces = tuple(mesh[1] for mesh in meshes)
             parts = [MeshPart(len(own), faces) for own, faces in meshes]
+            for index, body in enumerate(bodies):
+                parts[index] = replace(parts[index], is_drawn=body.splats is None)
             with CAPTURE.exclusive():
                 painter = Painter(Surfaces.build(parts, self._device), 1, self.height, self.width, self._device)
-                self._shown = _Shown(key, faces, painter)
+                self._shown = _Shown(key, [mesh[1] for mesh in meshes], [each.cloud for each in splats], painter)
         with CAPTURE.shared():
-            picture = self._shown.draw(vertices, albedo, shot)
+            picture = self._shown.draw(vertices, albedo, splats, shot)
         for body in bodies:
             if body.scalars is not None:
                 of_bodies = vertices[: sum(len(body.vertices) for body in bodies)]
@@ -137,15 +142,22 @@ class _Shown:
     The launches are made one by one, because a captured graph would exclude other threads while it is captured.
     """
 
-    def __init__(self, key: tuple, faces: tuple[np.ndarray, ...], painter: Painter) -> None:
+    def __init__(self, key: tuple, faces: Sequence[np.ndarray], clouds: Sequence[SplatCloud], painter: Painter) -> None:
         self.key, self._painter = key, painter
-        self._faces = faces  # an id is only unique while its owner lives
+        self._owners = faces, clouds  # an id is only unique while its owner lives
+        self._splats: SplatPainter | None = None
+        if clouds:
+            size, opacities = (1, painter.height, painter.width), np.concatenate([each.opacities for each in clouds])
+            self._splats = SplatPainter(opacities, joined_colors(clouds), *size, painter.device)
+            painter.layers.append(self._splats)
         graph = LaunchGraph(painter.device)
         painter.record(graph)
         self._launches = [launch for _, launch in graph.launches]
 
-    def draw(self, vertices: np.ndarray, albedo: np.ndarray, shot: Shot) -> np.ndarray:
+    def draw(self, vertices: np.ndarray, albedo: np.ndarray, splats: Sequence[MovedSplats], shot: Shot) -> np.ndarray:
         """Draw the meshes with these vertices ``(V, 3)`` [m] and linear colours ``(V, 3)``; returns a copy."""
+        for name in ("means", "covariances", "turns") if splats else ():
+            getattr(self._splats, name).assign(np.concatenate([getattr(each, name) for each in splats])[None])
         painter = self._painter
         painter.vertices.assign(vertices[None])
         painter.surfaces.albedo.assign(albedo[None])

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.splats import SplatCloud
 from piavatar_envs.render.markers import placed_mesh, turn_to_direction
 from piavatar_envs.sim.markers import TARGET, WIRE
 
@@ -24,6 +25,28 @@ _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
+class MovedSplats:
+    """Gaussian splats where they are now, in world coordinates.
+
+    Attributes:
+        cloud: opacities, and colours as at rest. Pass the same object every frame.
+        means: centres [m], shape ``(S, 3)``.
+        covariances: xx, xy, xz, yy, yz, zz [m^2], shape ``(S, 6)``.
+        turns: rotations from the rest pose, quaternions xyzw, shape ``(S, 4)``.
+    """
+
+    cloud: SplatCloud
+    means: np.ndarray
+    covariances: np.ndarray
+    turns: np.ndarray
+
+    def as_cloud(self) -> SplatCloud:
+        """Return a cloud of these splats, whose colours have turned with them."""
+        covariances = self.covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return SplatCloud.deformed(self.cloud, self.means, covariances, Rotation.from_quat(self.turns).as_matrix())
+
+
+@dataclass(frozen=True, eq=False)
 class Body:
     """One triangle mesh, in world coordinates.
 
@@ -35,6 +58,7 @@ class Body:
         scalars: what to colour by instead, shape ``(V,)``, for example the strain.
         scalar_max: the value of the last colour; the range is ``[0, scalar_max]``, the same in every frame.
         scalar_label: title of the colour scale.
+        splats: what is drawn instead of the mesh, which then casts shadows only.
     """
 
     vertices: np.ndarray
@@ -44,6 +68,7 @@ class Body:
     scalars: np.ndarray | None = None
     scalar_max: float = 0.3
     scalar_label: str = "max |stretch - 1|"
+    splats: MovedSplats | None = None
 
 
 @dataclass(frozen=True, eq=False)

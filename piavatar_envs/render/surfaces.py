@@ -28,6 +28,7 @@ class MeshPart:
         uv: place of the vertices in the image, from its upper left corner (0, 0) to its lower right (1, 1), repeated
             beyond, shape ``(V, 2)``; needed with a texture.
         subject: label of its pixels in a segmentation, from 1 to 255; 0 is the ground and the sky.
+        is_drawn: whether it is seen; it casts shadows in either case, such as those of splats that are drawn instead.
     """
 
     num_vertices: int
@@ -37,6 +38,7 @@ class MeshPart:
     texture: np.ndarray | None = None
     uv: np.ndarray | None = None
     subject: int = 1
+    is_drawn: bool = True
 
     def __post_init__(self) -> None:
         shape = (self.num_vertices, 3)
@@ -67,7 +69,7 @@ class Surfaces:
         texture: texture of each triangle, -1 without one, shape ``(T,)``.
         texels: textures with all their reduced levels, from the full size to one texel, sRGB, shape ``(K, n, 3)``.
         texture_size: side of the textures [texels], a power of two.
-        subject: label of each triangle, shape ``(T,)``.
+        subject: label of each triangle, -1 of one that is not drawn, shape ``(T,)``.
     """
 
     num_vertices: int
@@ -108,7 +110,7 @@ class Surfaces:
         size = _side(images)
         labels, textures, found = [], [], 0
         for mesh, own in zip(meshes, faces, strict=True):
-            labels.append(np.full(len(own), mesh.subject))
+            labels.append(np.full(len(own), mesh.subject if mesh.is_drawn else -1))
             textures.append(np.full(len(own), found if mesh.texture is not None else -1))
             found += mesh.texture is not None
         uv = [np.zeros((mesh.num_vertices, 2)) if mesh.uv is None else np.asarray(mesh.uv) for mesh in meshes]

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.core.arrays import vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.render import splats
-from piavatar_envs.render.raster import View
+from piavatar_envs.render import Body, Camera, MovedSplats, Renderer, Sphere, splats
 from piavatar_envs.render.splats import SplatPainter
+from piavatar_envs.render.views import View
+from tests.avatar.splat_clouds import on_body
 
 HEIGHT, WIDTH, FOCAL = 44, 52, 60.0
 SH0 = 0.28209479177387814
@@ -205,3 +209,38 @@ def test_wrong_clouds_are_refused():
     for opacities, shape in (([0.5, 0.5], (2, 3)), ([0.5], (1, 2, 3)), ([], (0, 1, 3)), ([1.5], (1, 1, 3))):
         with pytest.raises(ValueError, match="give"):
             SplatPainter(opacities, np.zeros(shape), 1, 8, 8, "cpu")
+
+
+def on_the_body(count: int = 20_000) -> tuple[Body, Body]:
+    """The embedded body as a mesh, and with splats on its skin instead."""
+    asset = load_asset()
+    cloud = on_body(asset, count, vertices=asset.mean_body().vertices)
+    covariances = cloud.covariances().reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    splats = MovedSplats(cloud, cloud.means, covariances, np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+    mesh = Body(asset.mean_body().vertices, asset.faces, (0.1, 0.2, 0.5))
+    return mesh, replace(mesh, splats=splats)
+
+
+def test_splats_cover_the_body_and_cast_its_shadow():
+    mesh, splats = on_the_body()
+    with Renderer(160, 160) as renderer:
+        empty = renderer.render([replace(mesh, vertices=mesh.vertices + [0.0, 0.0, 100.0])]).astype(int)
+        drawn, covered = (renderer.render([body]).astype(int) for body in (mesh, splats))
+        again = renderer.render([splats]).astype(int)
+    changed = np.abs(drawn - empty).max(axis=-1) > 12, np.abs(covered - empty).max(axis=-1) > 12
+    # the shadow, too; splats reach a pixel or two beyond
+    assert changed[1][changed[0]].mean() > 0.98
+    assert binary_dilation(changed[0], iterations=2)[changed[1]].mean() > 0.999
+    assert (again == covered).all()
+    # the shirt of the splats is striped, the mesh has one colour
+    assert np.abs(drawn - covered).max(axis=-1)[changed[0]].mean() > 20
+
+
+def test_markers_before_splats_hide_them():
+    _, splats = on_the_body(2_000)
+    camera = Camera(position=(0.0, -4.0, 1.0), target=(0.0, 0.0, 1.0))
+    with Renderer(64, 64, camera) as renderer:
+        for y, hidden in ((-0.6, True), (0.6, False)):
+            ball = Sphere(np.array([0.0, y, 1.15]), 0.1, (0.0, 1.0, 0.0))
+            red, green, _ = renderer.render([splats], [ball])[25, 32].astype(int)
+            assert (green > red) == hidden

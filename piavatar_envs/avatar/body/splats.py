@@ -8,6 +8,7 @@ in the order and with the signs of that paper's files.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -154,6 +155,17 @@ class SkinnedSplats:
     cloud: SplatCloud
     skin_joints: np.ndarray
     skin_weights: np.ndarray
+
+
+def joined_colors(clouds: Sequence[SplatCloud]) -> np.ndarray:
+    """Return the coefficients of the colours of several clouds, shape ``(S, K, 3)``, ``K`` of the highest degree."""
+    degree = max((cloud.degree for cloud in clouds), default=0)
+    joined = np.zeros((sum(map(len, clouds)), COEFFICIENTS[degree], 3), np.float32)
+    first = 0
+    for cloud in clouds:
+        joined[first : first + len(cloud), : cloud.sh.shape[1]] = cloud.sh
+        first += len(cloud)
+    return joined
 
 
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
