@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from piavatar_envs.render.scene import Color
-from piavatar_envs.render.views import View, ray_of
+from piavatar_envs.render.views import Rays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,20 +53,25 @@ class Ground:
 
 
 @wp.func
-def ground_at(view: View, x: float, y: float) -> wp.vec3:
-    """Return the ground seen at a pixel position: x, y [m] and the inverse depth [1/m], 0 above the horizon."""
-    ray = ray_of(view, x, y)
-    depth = (HEIGHT - view.eye[2]) / wp.min(ray[2], -1.0e-6)
-    inverse = wp.where(ray[2] < -1.0e-5 and depth > 0.0, 1.0 / depth, 0.0)
-    return wp.vec3(view.eye[0] + depth * ray[0], view.eye[1] + depth * ray[1], inverse)
+def ground_at(eye: wp.vec3, ray: wp.vec3) -> wp.vec3:
+    """Return the ground that a ray meets: x, y [m] and the inverse depth [1/m], 0 where it meets none."""
+    below = HEIGHT - eye[2]
+    result = wp.vec3()
+    if ray[2] < -1.0e-5 and below < 0.0:
+        depth = below / ray[2]
+        result = wp.vec3(eye[0] + depth * ray[0], eye[1] + depth * ray[1], ray[2] / below)
+    return result
 
 
 @wp.func
 def ground_share(at: wp.vec3, center: wp.vec2) -> float:
     """Return the opacity of the ground at a point of :func:`ground_at`."""
-    distance = wp.length(wp.vec2(at[0], at[1]) - center)
-    share = wp.clamp((FADE_END - distance) / (FADE_END - _FADE_START), 0.0, 1.0)
-    return wp.where(at[2] > 0.0, share * share * (3.0 - 2.0 * share), 0.0)
+    result = float(0.0)
+    if at[2] > 0.0:
+        distance = wp.length(wp.vec2(at[0], at[1]) - center)
+        share = wp.clamp((FADE_END - distance) / (FADE_END - _FADE_START), 0.0, 1.0)
+        result = share * share * (3.0 - 2.0 * share)
+    return result
 
 
 @wp.func
@@ -82,17 +87,21 @@ def lines_integral(x: float) -> float:
 
 
 @wp.func
-def checker(ground: Ground, view: View, at: wp.vec3, x: float, y: float) -> wp.vec3:
-    """Return the ground's colour averaged over the pixel at ``(x, y)``, which shows the point ``at``."""
-    across = ground_at(view, x + 1.0, y)
-    along = ground_at(view, x, y + 1.0)
-    width = wp.max((wp.abs(across[0] - at[0]) + wp.abs(along[0] - at[0])) / SQUARE, 1.0e-6)
-    height = wp.max((wp.abs(across[1] - at[1]) + wp.abs(along[1] - at[1])) / SQUARE, 1.0e-6)
+def checker(ground: Ground, rays: Rays, eye: wp.vec3, ray: wp.vec3, at: wp.vec3) -> wp.vec3:
+    """Return the ground's colour averaged over the pixel whose ray meets the ground at ``at``."""
+    # The derivatives of the point by the pixel's position.
+    scale = (HEIGHT - eye[2]) / (ray[2] * ray[2]) / SQUARE
+    right = (rays.right * ray[2] - ray * rays.right[2]) * scale
+    down = (rays.down * ray[2] - ray * rays.down[2]) * scale
+    width = wp.max(wp.abs(right[0]) + wp.abs(down[0]), 1.0e-6)
+    height = wp.max(wp.abs(right[1]) + wp.abs(down[1]), 1.0e-6)
     left = at[0] / SQUARE - 0.5 * width
     low = at[1] / SQUARE - 0.5 * height
-    sx = (triangle_wave(left) - triangle_wave(left + width)) / width
-    sy = (triangle_wave(low) - triangle_wave(low + height)) / height
+    across = 1.0 / width
+    along = 1.0 / height
+    sx = (triangle_wave(left) - triangle_wave(left + width)) * across
+    sy = (triangle_wave(low) - triangle_wave(low + height)) * along
     color = wp.lerp(ground.light, ground.dark, 0.5 - 0.5 * sx * sy)
-    lx = (lines_integral(left + width) - lines_integral(left)) / width
-    ly = (lines_integral(low + height) - lines_integral(low)) / height
+    lx = (lines_integral(left + width) - lines_integral(left)) * across
+    ly = (lines_integral(low + height) - lines_integral(low)) * along
     return wp.lerp(color, ground.line, lx + ly - lx * ly)

@@ -140,7 +140,7 @@ class Painter:
             (count, k),
             [
                 first, k, self._samples, self._ground, self._paint, views, self.centers, surfaces.triangles, vertices,
-                lighting.light, shadows.grids, shadows.opacity, raster.nearest, raster.num_large,
+                lighting.light, lighting.lit, shadows.grids, shadows.opacity, raster.nearest, raster.num_large,
             ],
             [_flat(self.color), _flat(self.nearest), _flat(self._labels)],
         )  # fmt: skip
@@ -156,7 +156,7 @@ class Painter:
         surfaces = self.surfaces
         samples = 8 * self.height * self.width * self._samples**2
         return max(
-            1, _WORKSPACE // (samples + Shadows.BYTES + 44 * surfaces.num_vertices + 12 * len(surfaces.triangles))
+            1, _WORKSPACE // (samples + Shadows.BYTES + 56 * surfaces.num_vertices + 12 * len(surfaces.triangles))
         )
 
     def _given(self, array: wp.array | None, name: str, shape: tuple[int, ...], dtype: type) -> wp.array:

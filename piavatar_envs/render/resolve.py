@@ -5,30 +5,22 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.render.ground import Ground, checker, ground_at, ground_share
+from piavatar_envs.render.shading import to_srgb
 from piavatar_envs.render.shadows import Grids, opacity_at
-from piavatar_envs.render.views import View, ray_of
+from piavatar_envs.render.views import View, ray_at, rays_of
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class Paint:
-    """Colours of the surfaces, as in :class:`piavatar_envs.render.surfaces.Surfaces`."""
+    """Textures and labels of the surfaces, as in :class:`piavatar_envs.render.surfaces.Surfaces`."""
 
-    albedo: wp.array2d[wp.vec3]
     uv: wp.array[wp.vec2]
     texture: wp.array[int]
     texels: wp.array3d[wp.uint8]
     texture_size: int
     subject: wp.array[int]
-
-
-@wp.func
-def to_srgb(light: float) -> float:
-    """Return the sRGB value of linear light, within half a byte (three square roots in place of a power)."""
-    a = wp.sqrt(wp.clamp(light, 0.0, 1.0))
-    b = wp.sqrt(a)
-    return wp.clamp(0.662002687 * a + 0.684122060 * b - 0.323583601 * wp.sqrt(b) - 0.0225411470 * light, 0.0, 1.0)
 
 
 @wp.func
@@ -72,56 +64,41 @@ def textured(paint: Paint, texture: int, uv: wp.vec2, texels_a_pixel: float) -> 
 
 
 @wp.func
-def shade(
-    view: View,
-    paint: Paint,
-    row: int,
-    triangle: int,
-    corner: wp.vec3i,
-    a: wp.vec3,
-    b: wp.vec3,
-    c: wp.vec3,
-    light_a: wp.vec4,
-    light_b: wp.vec4,
-    light_c: wp.vec4,
-    x: float,
-    y: float,
-) -> wp.vec3:
-    """Return the sRGB colour that a triangle shows at a pixel position.
+def weights_of(eye: wp.vec3, ray: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.vec3:
+    """Return the weights of a triangle's corners where a ray meets it.
 
-    The corners' weights are those of the ray's intersection (T. Moeller and B. Trumbore, "Fast, minimum storage
-    ray/triangle intersection", 1997).
+    T. Moeller and B. Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
     """
-    ray = ray_of(view, x, y)
     side = b - a
     other = c - a
     across = wp.cross(ray, other)
     determinant = wp.dot(side, across)
-    offset = view.eye - a
+    offset = eye - a
     scale = 1.0 / wp.where(wp.abs(determinant) > 1.0e-20, determinant, 1.0e-20)
     # A sample at the rim of a triangle seen edge-on would be far outside by rounding.
     wb = wp.clamp(wp.dot(offset, across) * scale, 0.0, 1.0)
     wc = wp.clamp(wp.dot(ray, wp.cross(offset, side)) * scale, 0.0, 1.0 - wb)
-    wa = 1.0 - wb - wc
-    light = wa * light_a + wb * light_b + wc * light_c
-    texture = paint.texture[triangle]
-    albedo = wp.vec3()
-    if texture < 0:
-        albedo = (
-            wa * paint.albedo[row, corner[0]] + wb * paint.albedo[row, corner[1]] + wc * paint.albedo[row, corner[2]]
-        )
-    else:
-        uv_a = paint.uv[corner[0]]
-        uv_b = paint.uv[corner[1]]
-        uv_c = paint.uv[corner[2]]
-        at = a + wb * side + wc * other - view.eye
-        depth = wp.dot(at, view.forward)
-        size = float(paint.texture_size)
-        u = uv_b - uv_a
-        v = uv_c - uv_a
-        of_texels = wp.abs(u[0] * v[1] - u[1] * v[0]) * size * size
-        of_pixels = view.focal * view.focal * wp.abs(wp.dot(wp.cross(side, other), at)) / (depth * depth * depth)
-        albedo = textured(paint, texture, wa * uv_a + wb * uv_b + wc * uv_c, of_texels / wp.max(of_pixels, 1.0e-9))
+    return wp.vec3(1.0 - wb - wc, wb, wc)
+
+
+@wp.func
+def shade_texture(
+    view: View, paint: Paint, texture: int, corner: wp.vec3i, a: wp.vec3, b: wp.vec3, c: wp.vec3, weights: wp.vec3,
+    light: wp.vec4,
+) -> wp.vec3:  # fmt: skip
+    """Return the sRGB colour that a textured triangle shows where its corners have these weights."""
+    uv_a = paint.uv[corner[0]]
+    uv_b = paint.uv[corner[1]]
+    uv_c = paint.uv[corner[2]]
+    at = weights[0] * a + weights[1] * b + weights[2] * c - view.eye
+    depth = wp.dot(at, view.forward)
+    size = float(paint.texture_size)
+    u = uv_b - uv_a
+    v = uv_c - uv_a
+    of_texels = wp.abs(u[0] * v[1] - u[1] * v[0]) * size * size
+    of_pixels = view.focal * view.focal * wp.abs(wp.dot(wp.cross(b - a, c - a), at)) / (depth * depth * depth)
+    uv = weights[0] * uv_a + weights[1] * uv_b + weights[2] * uv_c
+    albedo = textured(paint, texture, uv, of_texels / wp.max(of_pixels, 1.0e-9))
     return wp.vec3(
         to_srgb(albedo[0] * light[0] + light[3]),
         to_srgb(albedo[1] * light[1] + light[3]),
@@ -129,17 +106,10 @@ def shade(
     )
 
 
-@wp.func
-def background(
-    view: View, ground: Ground, own: Grids, opacity: wp.array2d[float], c: int, at: wp.vec3, share: float, x: float,
-    y: float,
-) -> wp.vec3:  # fmt: skip
-    """Return the sRGB colour of the ground or the sky at a pixel."""
-    color = wp.lerp(ground.sky_top, ground.sky_bottom, y / float(view.height))
-    if share > 0.0:
-        color = wp.lerp(color, checker(ground, view, at, x, y), share)
-        color = wp.lerp(color, ground.shadow, opacity_at(own, opacity, c, at[0], at[1]))
-    return color
+@wp.func_native("return keys.data[(size_t)keys.shape[1] * c + sample];")
+def key_at(keys: wp.array2d[wp.uint64], c: int, sample: int) -> wp.uint64:
+    """Return ``keys[c, sample]``."""
+    ...
 
 
 @wp.func
@@ -167,6 +137,7 @@ def resolve(
     triangles: wp.array[wp.vec3i],
     vertices: wp.array2d[wp.vec3],  # [m], (N, V)
     light: wp.array2d[wp.vec4],  # (C, V)
+    lit: wp.array2d[wp.vec3],
     grids: wp.array[Grids],
     opacity: wp.array2d[float],
     # in, out: cleared for the next run
@@ -183,7 +154,8 @@ def resolve(
     view = views[n]
     own = grids[c]
     center = centers[n]
-    albedo = wp.min(n, paint.albedo.shape[0] - 1)
+    rays = rays_of(view)
+    fall = 1.0 / float(view.height)
     wide = samples * view.width
     of_pixel = samples * samples
     spacing = 1.0 / float(samples)
@@ -196,10 +168,11 @@ def resolve(
         greatest = wp.uint64(0)
         for i in range(samples):
             for j in range(samples):
-                greatest = wp.max(greatest, keys[c, corner_sample + i * wide + j])
+                greatest = wp.max(greatest, key_at(keys, c, corner_sample + i * wide + j))
         x = float(column) + 0.5
         y = float(row) + 0.5
-        at = ground_at(view, x, y)
+        ray = ray_at(rays, x, y)
+        at = ground_at(view.eye, ray)
         share = ground_share(at, center)
         behind = wp.where(share > 0.0, at[2], 0.0)
         total = wp.vec3()
@@ -217,7 +190,7 @@ def resolve(
             for i in range(samples):
                 for j in range(samples):
                     sample = corner_sample + i * wide + j
-                    key = keys[c, sample]
+                    key = key_at(keys, c, sample)
                     if triangle_of(key) != t + 1:
                         greatest = wp.max(greatest, key)
                     else:
@@ -228,21 +201,19 @@ def resolve(
             corner = triangles[t]
             px = float(column) + (place[0] / float(count) + 0.5) * spacing
             py = float(row) + (place[1] / float(count) + 0.5) * spacing
-            seen = shade(
-                view,
-                paint,
-                albedo,
-                t,
-                corner,
-                vertices[n, corner[0]],
-                vertices[n, corner[1]],
-                vertices[n, corner[2]],
-                light[c, corner[0]],
-                light[c, corner[1]],
-                light[c, corner[2]],
-                px,
-                py,
-            )
+            p = vertices[n, corner[0]]
+            q = vertices[n, corner[1]]
+            r = vertices[n, corner[2]]
+            weights = weights_of(view.eye, ray_at(rays, px, py), p, q, r)
+            seen = weights[0] * lit[c, corner[0]] + weights[1] * lit[c, corner[1]] + weights[2] * lit[c, corner[2]]
+            texture = paint.texture[t]
+            if texture >= 0:
+                own_light = (
+                    weights[0] * light[c, corner[0]]
+                    + weights[1] * light[c, corner[1]]
+                    + weights[2] * light[c, corner[2]]
+                )
+                seen = shade_texture(view, paint, texture, corner, p, q, r, weights, own_light)
             total += float(count) * seen
             missing -= count
         if greatest != wp.uint64(0):
@@ -250,8 +221,12 @@ def resolve(
                 for j in range(samples):
                     keys[c, corner_sample + i * wide + j] = wp.uint64(0)
         if missing > 0:
-            total += float(missing) * background(view, ground, own, opacity, c, at, share, x, y)
-        color[n, pixel] = total / float(of_pixel)
+            back = wp.lerp(ground.sky_top, ground.sky_bottom, y * fall)
+            if share > 0.0:
+                back = wp.lerp(back, checker(ground, rays, view.eye, ray, at), share)
+                back = wp.lerp(back, ground.shadow, opacity_at(own, opacity, c, at[0], at[1]))
+            total += float(missing) * back
+        color[n, pixel] = total * (spacing * spacing)
         nearest[n, pixel] = in_front
         if labels.shape[0] > 0:
             labels[n, pixel] = wp.uint8(label)

@@ -128,6 +128,14 @@ def find_light(
 
 
 @wp.func
+def to_srgb(light: float) -> float:
+    """Return the sRGB value of linear light, within half a byte (three square roots in place of a power)."""
+    a = wp.sqrt(wp.clamp(light, 0.0, 1.0))
+    b = wp.sqrt(a)
+    return wp.clamp(0.662002687 * a + 0.684122060 * b - 0.323583601 * wp.sqrt(b) - 0.0225411470 * light, 0.0, 1.0)
+
+
+@wp.func
 def smoothed(offsets: wp.array[int], neighbours: wp.array[int], shares: wp.array2d[wp.vec2], c: int, i: int) -> wp.vec2:
     """Return the mean of a vertex and its neighbours."""
     begin = offsets[i]
@@ -167,15 +175,18 @@ def send_light(
     vertices: wp.array2d[wp.vec3],  # [m], (N, V)
     normals: wp.array2d[wp.vec3],  # (C, V)
     shares: wp.array2d[wp.vec2],
+    albedo: wp.array2d[wp.vec3],  # linear, (1 or N, V)
     # out
     light: wp.array2d[wp.vec4],  # (C, V)
+    lit: wp.array2d[wp.vec3],
 ):
-    """Find the light that leaves the vertices towards the eye: a factor of their albedo, and the gloss beside it."""
+    """Find the light that leaves the vertices towards the eye: a factor of their albedo, gloss, and their colour."""
     c, thread = wp.tid()
     eye = views[first + c].eye
+    row = wp.min(first + c, albedo.shape[0] - 1)
     for i in range(thread, num_vertices, threads):
         share = smoothed(offsets, neighbours, shares, c, i)
-        lit = share[0]
+        key_share = share[0]
         sky = share[1]
         normal = normals[c, i]
         toward = wp.normalize(eye - vertices[first + c, i])
@@ -186,16 +197,22 @@ def send_light(
         gloss = wp.max(wp.dot(normal, wp.normalize(toward + KEY)), 0.0)
         for _ in range(wp.static(_SHININESS)):
             gloss = gloss * gloss
-        gloss = gloss * _SPECULAR * lit * (0.4 + grazing)
+        gloss = gloss * _SPECULAR * key_share * (0.4 + grazing)
         result = wp.vec4(0.0, 0.0, 0.0, gloss)
         for channel in range(3):
             wrap = _WRAP[channel]
             key = wp.max((facing + wrap) / (1.0 + wrap), 0.0) * _KEY_LIGHT[channel]
             # The wrapped light passes a shadow's edge too: keep a little of its red.
-            key = key * (lit + (1.0 - lit) * (0.25 * wrap))
+            key = key * (key_share + (1.0 - key_share) * (0.25 * wrap))
             ambient = (_GROUND_LIGHT[channel] + (_SKY_LIGHT[channel] - _GROUND_LIGHT[channel]) * up) * sky
             result[channel] = key + ambient + _RIM_LIGHT[channel] * rim
         light[c, i] = result
+        own = albedo[row, i]
+        lit[c, i] = wp.vec3(
+            to_srgb(own[0] * result[0] + gloss),
+            to_srgb(own[1] * result[1] + gloss),
+            to_srgb(own[2] * result[2] + gloss),
+        )
 
 
 class Lighting:
@@ -203,6 +220,7 @@ class Lighting:
 
     Attributes:
         light: factor of each vertex's albedo (three channels) and gloss, linear, shape ``(C, V)``.
+        lit: sRGB that it shows in this light, shape ``(C, V)``.
     """
 
     def __init__(self, surfaces: Surfaces, pictures: int, device: wp.Device) -> None:
@@ -218,6 +236,7 @@ class Lighting:
         self._normals = wp.zeros(shape, dtype=wp.vec3, device=device)
         self._shares = [wp.zeros(shape, dtype=wp.vec2, device=device) for _ in range(2)]
         self.light = wp.zeros(shape, dtype=wp.vec4, device=device)
+        self.lit = wp.zeros(shape, dtype=wp.vec3, device=device)
 
     def record(
         self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, views: wp.array, shadows: Shadows,
@@ -253,6 +272,6 @@ class Lighting:
         graph.launch(
             send_light,
             (count, k),
-            [first, surfaces.num_vertices, k, *around, views, vertices, self._normals, near],
-            [self.light],
+            [first, surfaces.num_vertices, k, *around, views, vertices, self._normals, near, surfaces.albedo],
+            [self.light, self.lit],
         )

@@ -45,16 +45,14 @@ _AREA_UNIT, _BLUR_SUM = 1024, 9**3
 AREA_SCALE = wp.constant(1.0 / (_AREA_UNIT * _BLUR_SUM))
 _AREA_UNITS = wp.constant(float(_AREA_UNIT))
 
-#: Texels of the ground's patch along a side, the least one [m], the largest one [m], and room around the shadow [m].
-PATCH = 192
-_SIZE = wp.constant(PATCH)
-_TEXEL, _LARGEST, _ROOM = wp.constant(0.016), wp.constant(0.5), wp.constant(0.25)
-#: Layers of the patch: three bands of height, softer the higher, and contact. Shifts of their size, and first texels.
+#: Most texels of the ground's patch along a side, the least one [m], and the largest one [m].
+PATCH_LIMIT = wp.constant(192)
+_TEXEL, _LARGEST = wp.constant(0.016), wp.constant(0.5)
+#: Texels around the shadow, in those of the coarsest layer, four times as large: as far as it is blurred.
+_PATCH_MARGIN = wp.constant(2)
+#: Layers of the patch: three bands of height, softer the higher, and contact. By how much their texels are larger.
 _SHIFTS = (0, 1, 2, 1)
-_FIRST = tuple(int(n) for n in np.cumsum([0] + [(PATCH >> shift) ** 2 for shift in _SHIFTS]))
-LAYER_TEXELS = _FIRST[-1]
-_LAYERS = wp.constant(LAYER_TEXELS)
-_FIRST_1, _FIRST_2, _FIRST_3 = (wp.constant(n) for n in _FIRST[1:4])
+LAYER_TEXELS = sum(int(PATCH_LIMIT >> shift) ** 2 for shift in _SHIFTS)
 #: Upper ends of the lower bands [m].
 _LOW_BAND, _MIDDLE_BAND = wp.constant(0.25), wp.constant(0.9)
 #: Lower than this nothing casts a shadow on the ground from below [m].
@@ -69,6 +67,8 @@ _COVER_SCALE = wp.constant(1.0 / (_COVER_UNIT * 81))
 #: Most pieces along an edge of a triangle.
 _MOST_PIECES = wp.constant(32)
 
+#: Threads of a picture that find its extents at most.
+_EXTENT_THREADS = 256
 #: Quantities whose extent is found: x, y, z; the map's x and y; the shadow's x and y on the ground.
 EXTENTS = 7
 _EXTENTS = wp.constant(EXTENTS)
@@ -90,6 +90,8 @@ class Grids:
     voxels_z: int
     patch_origin: wp.vec2
     patch_texel: float
+    patch_rows: int
+    patch_columns: int
 
 
 @wp.func
@@ -186,13 +188,20 @@ def place_grids(
     own.voxels_z = counts[2]
 
     texel = float(_TEXEL)
-    extent = wp.max(greatest[5] - least[5], greatest[6] - least[6]) + 2.0 * _ROOM
-    while float(_SIZE) * texel < extent and texel < _LARGEST:
-        texel = texel * _GROWTH
+    fits = bool(False)
+    while not fits:
+        for axis in range(2):
+            begin = int(wp.floor(least[5 + axis] / (4.0 * texel))) - _PATCH_MARGIN
+            end = int(wp.floor(greatest[5 + axis] / (4.0 * texel))) + _PATCH_MARGIN + 1
+            origin[axis] = begin
+            counts[axis] = 4 * (end - begin)
+        fits = wp.max(counts[0], counts[1]) <= PATCH_LIMIT or texel > _LARGEST
+        if not fits:
+            texel = texel * _GROWTH
     own.patch_texel = texel
-    for axis in range(2):
-        corner = 0.5 * (least[5 + axis] + greatest[5 + axis] - float(_SIZE) * texel)
-        own.patch_origin[axis] = wp.floor(corner / (4.0 * texel)) * 4.0 * texel
+    own.patch_origin = wp.vec2(4.0 * texel * float(origin[0]), 4.0 * texel * float(origin[1]))
+    own.patch_rows = wp.min(counts[0], PATCH_LIMIT)
+    own.patch_columns = wp.min(counts[1], PATCH_LIMIT)
     grids[c] = own
 
 
@@ -213,7 +222,7 @@ def clear_grids(
         depth[c, i] = NO_DEPTH
     for i in range(thread, own.voxels_x * own.voxels_y * own.voxels_z, threads):
         area[c, i] = 0
-    for i in range(thread, _LAYERS, threads):
+    for i in range(thread, layer_begin(own, 4), threads):
         cover[c, i] = 0
 
 
@@ -221,10 +230,27 @@ def clear_grids(
 def patch_cell(own: Grids, x: float, y: float, shift: int) -> int:
     """Return the cell of a layer of the patch at a point of the ground [m], -1 outside."""
     texel = own.patch_texel * float(1 << shift)
-    size = _SIZE >> shift
+    columns = own.patch_columns >> shift
     i = int(wp.floor((x - own.patch_origin[0]) / texel))
     j = int(wp.floor((y - own.patch_origin[1]) / texel))
-    return wp.where(i >= 0 and j >= 0 and i < size and j < size, i * size + j, -1)
+    inside = i >= 0 and j >= 0 and i < own.patch_rows >> shift and j < columns
+    return wp.where(inside, i * columns + j, -1)
+
+
+@wp.func
+def layer_begin(own: Grids, layer: int) -> int:
+    """Return the first texel of a layer of the patch; of layer 4, the number of texels of all layers."""
+    texels = own.patch_rows * own.patch_columns
+    result = int(0)
+    if layer >= 1:
+        result += texels
+    if layer >= 2:
+        result += texels >> 2
+    if layer >= 3:
+        result += texels >> 4
+    if layer >= 4:
+        result += texels >> 2
+    return result
 
 
 @wp.func
@@ -256,18 +282,17 @@ def cast_piece(
     facing = wp.dot(KEY, area)
     if facing > 0.0 and at[2] > _SUNK:
         shift = wp.where(height <= _LOW_BAND, 0, wp.where(height <= _MIDDLE_BAND, 1, 2))
-        first = wp.where(shift == 0, 0, wp.where(shift == 1, _FIRST_1, _FIRST_2))
         cell = patch_cell(own, at[0] - height * _SLANT[0], at[1] - height * _SLANT[1], shift)
         if cell >= 0:
             texel = own.patch_texel * float(1 << shift)
             units = wp.min(facing / (KEY[2] * texel * texel) * _COVER_UNITS, _COVER_MOST)
-            wp.atomic_add(cover, c, first + cell, int(units + 0.5))
+            wp.atomic_add(cover, c, layer_begin(own, shift) + cell, int(units + 0.5))
     if area[2] < 0.0 and height < 4.0 * _CONTACT_HEIGHT and at[2] > _SUNK:
         cell = patch_cell(own, at[0], at[1], 1)
         if cell >= 0:
             texel = 2.0 * own.patch_texel
             units = wp.min(-area[2] / (texel * texel) * _COVER_UNITS, _COVER_MOST)
-            wp.atomic_add(cover, c, _FIRST_3 + cell, int(units * wp.exp(-height / _CONTACT_HEIGHT) + 0.5))
+            wp.atomic_add(cover, c, layer_begin(own, 3) + cell, int(units * wp.exp(-height / _CONTACT_HEIGHT) + 0.5))
 
 
 @wp.kernel
@@ -329,21 +354,9 @@ def blurred(values: wp.array2d[int], c: int, cell: int, stride: int, place: int,
 
 
 @wp.func
-def layer_place(i: int) -> wp.vec4i:
-    """Return first texel, size, row and column of a texel of the patch's layers."""
-    first = int(0)
-    size = int(_SIZE)
-    if i >= _FIRST_3:
-        first = _FIRST_3
-        size = _SIZE // 2
-    elif i >= _FIRST_2:
-        first = _FIRST_2
-        size = _SIZE // 4
-    elif i >= _FIRST_1:
-        first = _FIRST_1
-        size = _SIZE // 2
-    row = (i - first) // size
-    return wp.vec4i(first, size, row, i - first - row * size)
+def shift_of(layer: int) -> int:
+    """Return by how many powers of two the texels of a layer are larger than those of the first."""
+    return wp.where(layer == 3, 1, layer)
 
 
 @wp.kernel
@@ -373,9 +386,11 @@ def blur_first(
     stride = own.voxels_y * own.voxels_z
     for i in range(thread, own.voxels_x * stride, threads):
         area_out[c, i] = blurred(area, c, i, stride, i // stride, own.voxels_x)
-    for i in range(thread, _LAYERS, threads):
-        place = layer_place(i)
-        cover_out[c, i] = blurred(cover, c, i, 1, place[3], place[1])
+    for layer in range(4):
+        begin = layer_begin(own, layer)
+        columns = own.patch_columns >> shift_of(layer)
+        for i in range(thread, layer_begin(own, layer + 1) - begin, threads):
+            cover_out[c, begin + i] = blurred(cover, c, begin + i, 1, i % columns, columns)
 
 
 @wp.kernel
@@ -394,27 +409,33 @@ def blur_second(
     own = grids[c]
     for i in range(thread, own.voxels_x * own.voxels_y * own.voxels_z, threads):
         area_out[c, i] = blurred(area, c, i, own.voxels_z, (i // own.voxels_z) % own.voxels_y, own.voxels_y)
-    for i in range(thread, _LAYERS, threads):
-        place = layer_place(i)
-        cover_out[c, i] = wp.min(blurred(cover, c, i, place[1], place[2], place[1]), _COVER_FULL)
+    for layer in range(4):
+        begin = layer_begin(own, layer)
+        columns = own.patch_columns >> shift_of(layer)
+        rows = own.patch_rows >> shift_of(layer)
+        for i in range(thread, rows * columns, threads):
+            total = blurred(cover, c, begin + i, columns, i // columns, rows)
+            cover_out[c, begin + i] = wp.min(total, _COVER_FULL)
 
 
 @wp.func
-def layer_at(cover: wp.array2d[int], c: int, first: int, shift: int, i: int, j: int) -> float:
+def layer_at(own: Grids, cover: wp.array2d[int], c: int, layer: int, i: int, j: int) -> float:
     """Return the share of a texel of the patch that a layer covers, between the layer's texels."""
-    size = _SIZE >> shift
+    shift = shift_of(layer)
+    rows = own.patch_rows >> shift
+    columns = own.patch_columns >> shift
     scale = 1.0 / float(1 << shift)
-    x = wp.clamp((float(i) + 0.5) * scale - 0.5, 0.0, float(size - 1))
-    y = wp.clamp((float(j) + 0.5) * scale - 0.5, 0.0, float(size - 1))
-    row = wp.min(int(x), size - 2)
-    column = wp.min(int(y), size - 2)
+    x = wp.clamp((float(i) + 0.5) * scale - 0.5, 0.0, float(rows - 1))
+    y = wp.clamp((float(j) + 0.5) * scale - 0.5, 0.0, float(columns - 1))
+    row = wp.min(int(x), rows - 2)
+    column = wp.min(int(y), columns - 2)
     u = x - float(row)
     v = y - float(column)
-    cell = first + row * size + column
+    cell = layer_begin(own, layer) + row * columns + column
     a = float(cover[c, cell])
     b = float(cover[c, cell + 1])
-    d = float(cover[c, cell + size])
-    e = float(cover[c, cell + size + 1])
+    d = float(cover[c, cell + columns])
+    e = float(cover[c, cell + columns + 1])
     return ((1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * d + v * e)) * _COVER_SCALE
 
 
@@ -427,20 +448,20 @@ def blur_third(
     cover: wp.array2d[int],
     # out
     area_out: wp.array2d[int],
-    opacity: wp.array2d[float],  # of the shadow on the patch, (C, 192 * 192)
+    opacity: wp.array2d[float],  # of the shadow on the patch, (C, PATCH_LIMIT**2)
 ):
     """Blur the voxels along z, and join the layers of the patch to the shadow's opacity."""
     c, thread = wp.tid()
     own = grids[c]
     for i in range(thread, own.voxels_x * own.voxels_y * own.voxels_z, threads):
         area_out[c, i] = blurred(area, c, i, 1, i % own.voxels_z, own.voxels_z)
-    for k in range(thread, _SIZE * _SIZE, threads):
-        i = k // _SIZE
-        j = k - i * _SIZE
+    for k in range(thread, own.patch_rows * own.patch_columns, threads):
+        i = k // own.patch_columns
+        j = k - i * own.patch_columns
         clear = 1.0 - float(cover[c, k]) * _COVER_SCALE
-        clear *= 1.0 - layer_at(cover, c, _FIRST_1, 1, i, j)
-        clear *= 1.0 - layer_at(cover, c, _FIRST_2, 2, i, j)
-        contact = layer_at(cover, c, _FIRST_3, 1, i, j)
+        clear *= 1.0 - layer_at(own, cover, c, 1, i, j)
+        clear *= 1.0 - layer_at(own, cover, c, 2, i, j)
+        contact = layer_at(own, cover, c, 3, i, j)
         opacity[c, k] = 1.0 - (1.0 - _STRENGTH * (1.0 - clear)) * (1.0 - _CONTACT_STRENGTH * contact)
 
 
@@ -450,14 +471,14 @@ def opacity_at(own: Grids, opacity: wp.array2d[float], c: int, x: float, y: floa
     u = (x - own.patch_origin[0]) / own.patch_texel - 0.5
     v = (y - own.patch_origin[1]) / own.patch_texel - 0.5
     result = float(0.0)
-    if u >= 0.0 and v >= 0.0 and u < float(_SIZE - 1) and v < float(_SIZE - 1):
+    if u >= 0.0 and v >= 0.0 and u < float(own.patch_rows - 1) and v < float(own.patch_columns - 1):
         i = int(u)
         j = int(v)
         fu = u - float(i)
         fv = v - float(j)
-        k = i * _SIZE + j
+        k = i * own.patch_columns + j
         result = (1.0 - fu) * ((1.0 - fv) * opacity[c, k] + fv * opacity[c, k + 1]) + fu * (
-            (1.0 - fv) * opacity[c, k + _SIZE] + fv * opacity[c, k + _SIZE + 1]
+            (1.0 - fv) * opacity[c, k + own.patch_columns] + fv * opacity[c, k + own.patch_columns + 1]
         )
     return result
 
@@ -470,11 +491,11 @@ class Shadows:
         areas: outward normals times area of the triangles [m^2], zero where hidden, shape ``(C, T)``.
         depth: of the map from the light, in units of 1 / :data:`DEPTH_SCALE` m, shape ``(C, MAP_LIMIT**2)``.
         filled: blurred area in the voxels, over their own, in units of :data:`AREA_SCALE`, shape ``(C, VOXEL_LIMIT)``.
-        opacity: of the shadow on the ground, shape ``(C, PATCH**2)``.
+        opacity: of the shadow on the ground, shape ``(C, PATCH_LIMIT**2)``.
     """
 
     #: Memory of the grids of one picture.
-    BYTES = 4 * (2 * MAP_LIMIT**2 + 2 * VOXEL_LIMIT + 2 * LAYER_TEXELS + PATCH**2)
+    BYTES = 4 * (2 * MAP_LIMIT**2 + 2 * VOXEL_LIMIT + 2 * LAYER_TEXELS + PATCH_LIMIT**2)
 
     def __init__(self, surfaces: Surfaces, pictures: int, device: wp.Device) -> None:
         """Allocate the grids.
@@ -497,7 +518,7 @@ class Shadows:
         self._areas = ints(VOXEL_LIMIT), ints(VOXEL_LIMIT)
         self._covers = ints(LAYER_TEXELS), ints(LAYER_TEXELS)
         self.depth, self.filled = self._depths[1], self._areas[1]
-        self.opacity = wp.zeros((pictures, PATCH**2), dtype=float, device=device)
+        self.opacity = wp.zeros((pictures, PATCH_LIMIT**2), dtype=float, device=device)
 
     def record(self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, threads: Threads) -> None:
         """Append the launches that find the shadows of a chunk.
@@ -512,7 +533,8 @@ class Shadows:
         surfaces, (depth, widened), (area, area_2), (cover, cover_2) = (
             self._surfaces, self._depths, self._areas, self._covers,
         )  # fmt: skip
-        k = threads(surfaces.num_vertices)
+        # Few threads, because all of them meet at the same extents.
+        k = min(threads(surfaces.num_vertices), _EXTENT_THREADS)
         graph.launch(find_extents, (count, k), [first, surfaces.num_vertices, k, vertices], [self._low, self._high])
         graph.launch(place_grids, count, [self._low, self._high], [self.grids])
         cells = threads(LAYER_TEXELS)

@@ -31,12 +31,29 @@ def to_camera(view: View, point: wp.vec3) -> wp.vec3:
     return wp.vec3(wp.dot(offset, view.right), wp.dot(offset, view.up), wp.dot(offset, view.forward))
 
 
+@wp.struct
+class Rays:
+    """Rays of a picture: through its upper left corner, and their change for a pixel to the right and down."""
+
+    corner: wp.vec3
+    right: wp.vec3
+    down: wp.vec3
+
+
 @wp.func
-def ray_of(view: View, x: float, y: float) -> wp.vec3:
-    """Return the ray through a pixel position, x to the right and y down [px]; its depth along the axis is one."""
-    right = (x - 0.5 * float(view.width)) / view.focal
-    up = (0.5 * float(view.height) - y) / view.focal
-    return view.forward + right * view.right + up * view.up
+def rays_of(view: View) -> Rays:
+    """Return the rays of a view, of depth one along its axis."""
+    rays = Rays()
+    rays.right = view.right / view.focal
+    rays.down = -view.up / view.focal
+    rays.corner = view.forward - 0.5 * (float(view.width) * rays.right + float(view.height) * rays.down)
+    return rays
+
+
+@wp.func
+def ray_at(rays: Rays, x: float, y: float) -> wp.vec3:
+    """Return the ray through a pixel position, x to the right and y down [px]."""
+    return rays.corner + x * rays.right + y * rays.down
 
 
 @dataclass(frozen=True, eq=False)
