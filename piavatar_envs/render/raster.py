@@ -136,29 +136,35 @@ def draw(
 ):
     """Draw every ``rows``-th row from ``row`` on, and in it every ``lanes``-th sample from ``lane`` on."""
     width = samples * view.width
-    for y in range(frame.top + row, frame.bottom + 1, rows):
-        for x in range(frame.left + lane, frame.right + 1, lanes):
-            px = float(x) + 0.5
+    if frame.kind == 1:
+        for y in range(frame.top + row, frame.bottom + 1, rows):
             py = float(y) + 0.5
-            inverse = float(0.0)
-            if frame.kind == 1:
+            x = frame.left + lane
+            while x <= frame.right:
+                px = float(x) + 0.5
                 wa = edge(frame.b, frame.c, px, py)
                 wb = edge(frame.c, frame.a, px, py)
                 wc = edge(frame.a, frame.b, px, py)
-                if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
+                if wp.min(wa, wp.min(wb, wc)) >= 0.0:
                     total = wa + wb + wc
                     if total > 0.0:
                         inverse = (wa * frame.a[2] + wb * frame.b[2] + wc * frame.c[2]) / total
-            else:
-                s = 1.0 / (float(samples) * view.focal)
-                ray = wp.vec3((px - 0.5 * float(width)) * s, (0.5 * float(samples * view.height) - py) * s, 1.0)
+                        keep_nearest(nearest, picture, y * width + x, inverse, triangle)
+                x += lanes
+    else:
+        scale = 1.0 / (float(samples) * view.focal)
+        volume = wp.dot(wp.cross(b - a, c - a), a)
+        for y in range(frame.top + row, frame.bottom + 1, rows):
+            for x in range(frame.left + lane, frame.right + 1, lanes):
+                px = (float(x) + 0.5 - 0.5 * float(width)) * scale
+                py = (0.5 * float(samples * view.height) - float(y) - 0.5) * scale
+                ray = wp.vec3(px, py, 1.0)
                 ua = wp.dot(wp.cross(b, c), ray)
                 ub = wp.dot(wp.cross(c, a), ray)
                 uc = wp.dot(wp.cross(a, b), ray)
-                if ua >= 0.0 and ub >= 0.0 and uc >= 0.0:
-                    inverse = (ua + ub + uc) / wp.dot(wp.cross(b - a, c - a), a)
-            if inverse > 0.0 and inverse <= _MOST:
-                keep_nearest(nearest, picture, y * width + x, inverse, triangle)
+                inverse = (ua + ub + uc) / volume
+                if wp.min(ua, wp.min(ub, uc)) >= 0.0 and inverse > 0.0 and inverse <= _MOST:
+                    keep_nearest(nearest, picture, y * width + x, inverse, triangle)
 
 
 @wp.kernel
