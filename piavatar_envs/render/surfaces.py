@@ -95,17 +95,21 @@ class Surfaces:
             num_albedos: rows of :attr:`albedo`: one for all pictures, or one for each.
 
         Raises:
-            ValueError: a triangle has a corner outside its mesh.
+            ValueError: no mesh, or a triangle that has a corner outside its mesh.
         """
+        if not meshes:
+            raise ValueError("nothing to draw: give at least one mesh")
         counts = [mesh.num_vertices for mesh in meshes]
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         faces = []
         for mesh, offset in zip(meshes, first, strict=False):
             own = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
             if len(own) and not (own.min() >= 0 and own.max() < mesh.num_vertices):
-                raise ValueError(f"faces have corners up to {own.max()}, and the mesh has {mesh.num_vertices} vertices")
+                raise ValueError(
+                    f"faces have corners from {own.min()} to {own.max()}, and the mesh has {mesh.num_vertices} vertices"
+                )
             faces.append(own + offset)
-        triangles = np.concatenate(faces) if faces else np.zeros((0, 3), np.int64)
+        triangles = np.concatenate(faces)
         images = [mesh.texture for mesh in meshes if mesh.texture is not None]
         size = _side(images)
         labels, textures, found = [], [], 0
@@ -135,11 +139,11 @@ class Surfaces:
             neighbour_offsets=upload(neighbours[0], wp.int32),
             neighbours=upload(neighbours[1], wp.int32),
             albedo=wp.array(np.tile(np.concatenate(albedo), (num_albedos, 1, 1)), dtype=wp.vec3, device=device),
-            uv=upload(np.concatenate(uv or [np.zeros((0, 2))]).astype(np.float32), wp.vec2),
-            texture=upload(np.concatenate(textures or [np.zeros(0)]).astype(np.int32), wp.int32),
+            uv=upload(np.concatenate(uv).astype(np.float32), wp.vec2),
+            texture=upload(np.concatenate(textures).astype(np.int32), wp.int32),
             texels=upload(texels, wp.uint8),
             texture_size=size,
-            subject=upload(np.concatenate(labels or [np.zeros(0)]).astype(np.int32), wp.int32),
+            subject=upload(np.concatenate(labels).astype(np.int32), wp.int32),
         )
 
 

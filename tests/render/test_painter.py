@@ -249,8 +249,10 @@ def test_colours_of_vertices_and_rows_of_albedo(device):
     assert second.argmax() == 1
     with pytest.raises(ValueError, match="a row a vertex"):
         MeshPart(5, faces, colors=green)
-    with pytest.raises(ValueError, match="corners up to"):
+    with pytest.raises(ValueError, match="corners from 0 to 3"):
         Surfaces.build([MeshPart(3, faces)], device)
+    with pytest.raises(ValueError, match="at least one mesh"):
+        Surfaces.build([], device)
 
 
 def test_a_row_of_a_batch_is_the_picture_alone_and_runs_are_equal(device, monkeypatch):
