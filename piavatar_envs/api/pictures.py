@@ -26,7 +26,7 @@ from piavatar_envs.sim.forces import Target
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from piavatar_envs.render import Arrow, Camera, Marker, Scene
+    from piavatar_envs.render import Arrow, Camera, Marker, MovedSplats, Scene
     from piavatar_envs.render.live import Drag, LiveView
     from piavatar_envs.render.stage import Stage
 
@@ -115,13 +115,19 @@ class SceneReader:
             own = vertices[part.vertices]
             if part.kind in ("avatar", "prop"):
                 strain = self._strain(env, len(bodies)) if color == "strain" and part.kind == "avatar" else None
-                bodies.append(Body(own, part.faces, part.color, part.colors, scalars=strain))
+                splats = self._splats(len(bodies)) if color == "skin" and part.kind == "avatar" else None
+                bodies.append(Body(own, part.faces, part.color, part.colors, scalars=strain, splats=splats))
             elif np.isfinite(own[0, 0]):  # hidden ones are NaN
                 markers.append(Solid(part.kind, own, part.faces, part.color))
         markers += [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in simulation.avatars]
         follow = np.mean(roots, axis=0) if task.camera_follows else None
         return Scene(bodies, markers, follow)
+
+    def _splats(self, index: int) -> MovedSplats | None:
+        """Return the splats of an avatar, if it is drawn as such."""
+        splats = self.stage.splats
+        return None if splats is None or index not in splats.bound else splats.moved(0, index)
 
     def _strain(self, env: int, index: int) -> np.ndarray:
         """Return the strain of an avatar at its vertices."""

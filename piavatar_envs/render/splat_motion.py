@@ -18,14 +18,14 @@ from functools import cached_property
 
 import numpy as np
 import warp as wp
-from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
-from piavatar_envs.avatar.body.splats import COEFFICIENTS, SplatCloud
+from piavatar_envs.avatar.body.splats import SplatCloud, joined_colors
 from piavatar_envs.avatar.skinning import blend_places
 from piavatar_envs.core.arrays import vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
+from piavatar_envs.render.scene import MovedSplats
 from piavatar_envs.render.skin import Skin, SkinMotion, SkinSurface, SkinWorkspace, record_skin, skin_workspace
 from piavatar_envs.sim.world import Simulation
 
@@ -264,13 +264,8 @@ class SplatMotion:
 
     @cached_property
     def sh(self) -> np.ndarray:
-        """Coefficients of their colours at rest, shape ``(S, K, 3)`` float32, ``K`` of their highest degree."""
-        clouds = [one.cloud for one in self.bound.values()]
-        degree = max((cloud.degree for cloud in clouds), default=0)
-        sh = np.zeros((sum(map(len, clouds)), COEFFICIENTS[degree], 3), np.float32)
-        for cloud, own in zip(clouds, self.slices.values(), strict=True):
-            sh[own, : cloud.sh.shape[1]] = cloud.sh
-        return sh
+        """Coefficients of their colours at rest, shape ``(S, K, 3)`` float32."""
+        return joined_colors([one.cloud for one in self.bound.values()])
 
     def __len__(self) -> int:
         return len(self.opacities)
@@ -288,10 +283,8 @@ class SplatMotion:
             out = self.covariances, self.turns, first
             record_turns(graph, self.envs, surface, motion, workspace, stencils, *out)
 
-    def cloud(self, picture: int, avatar: int) -> SplatCloud:
-        """Return the splats of an avatar as they are now, with colours that have turned with them."""
-        own = self.slices[avatar]
-        c = self.covariances.numpy()[picture, own]
-        covariances = c[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-        turns = Rotation.from_quat(self.turns.numpy()[picture, own]).as_matrix()
-        return SplatCloud.deformed(self.bound[avatar].cloud, self.means.numpy()[picture, own], covariances, turns)
+    def moved(self, picture: int, avatar: int) -> MovedSplats:
+        """Return the splats of an avatar in a picture, as they are now."""
+        arrays = (self.means, self.covariances, self.turns)
+        values = [array[picture].numpy()[self.slices[avatar]] for array in arrays]
+        return MovedSplats(self.bound[avatar].cloud, *(value.copy() for value in values))

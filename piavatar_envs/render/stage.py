@@ -24,6 +24,8 @@ from piavatar_envs.render.skin import (
     record_skin,
     skin_workspace,
 )
+from piavatar_envs.render.splat_motion import SplatMotion
+from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.sim.markers import Markers, MarkerSpec, allocate_markers
 from piavatar_envs.sim.world import Simulation
@@ -77,6 +79,7 @@ class Stage:
         parts: what stands there, in the order of the vertices.
         subjects: names by label: the ground, avatars, props, colliders, and all markers together.
         skins: the skin of every avatar.
+        splats: the splats of all avatars that are drawn as such; None without any.
         vertices: in the world [m], ``(num_pictures, vertices)``; NaN of a marker that is hidden.
         markers: of all environments, where they are; written by the task.
     """
@@ -108,12 +111,32 @@ class Stage:
         self.vertices = wp.zeros((self.num_pictures, count), dtype=wp.vec3, device=self.device)
         self.markers = allocate_markers(markers, simulation.num_envs, self.device)
         self._specs = tuple(markers)
+        splats = SplatMotion(simulation, self.envs)
+        self.splats = splats if splats.bound else None
 
     @cached_property
     def surfaces(self) -> Surfaces:
-        """The surfaces for a painter, on the device: one colouring for all pictures."""
-        meshes = [MeshPart(p.num_vertices, p.faces, p.color, p.colors, subject=p.subject) for p in self.parts]
+        """The surfaces for a painter, on the device: one colouring for all pictures.
+
+        Of avatars that are drawn as splats, only the shadow of the body's skin.
+        """
+        meshes = []
+        for index, part in enumerate(self.parts):
+            drawn = self.splats is None or index not in self.splats.bound
+            given = part.num_vertices, part.faces, part.color, part.colors
+            meshes.append(MeshPart(*given, subject=part.subject, is_drawn=drawn))
         return Surfaces.build(meshes, self.device)
+
+    def layers(self, height: int, width: int) -> list[SplatPainter]:
+        """Return what a painter of such pictures has to draw over the surfaces: nothing, or the splats."""
+        if self.splats is None:
+            return []
+        labels = np.zeros(len(self.splats), np.uint8)
+        for avatar, own in self.splats.slices.items():
+            labels[own] = self.parts[avatar].subject
+        own = self.splats
+        given = own.opacities, own.sh, self.num_pictures, height, width, self.device
+        return [SplatPainter(*given, motion=(own.means, own.covariances, own.turns), subjects=labels)]
 
     def select(self, envs: Sequence[int]) -> None:
         """Show these environments from now on, as many as there are pictures."""
@@ -154,6 +177,8 @@ class Stage:
 
     def record(self, graph: LaunchGraph) -> None:
         """Append the launches that write the vertices of all pictures from the present state."""
+        if self.splats is not None:
+            self.splats.record(graph)
         first = iter([part.vertices.start for part in self.parts])
         for avatar in range(len(self.skins)):
             self._record_skin(graph, avatar, next(first))

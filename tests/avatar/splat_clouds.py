@@ -12,7 +12,12 @@ _SKIN, _SHIRT, _STRIPE, _TROUSERS = (0.85, 0.65, 0.55), (0.75, 0.15, 0.2), (0.92
 
 
 def on_body(
-    asset: AvatarAsset, count: int, degree: int = 1, seed: int = 0, vertices: np.ndarray | None = None
+    asset: AvatarAsset,
+    count: int,
+    degree: int = 1,
+    seed: int = 0,
+    vertices: np.ndarray | None = None,
+    inset: float = 0.0,
 ) -> SplatCloud:
     """Return flat splats that cover the skin of a body evenly.
 
@@ -22,6 +27,8 @@ def on_body(
         degree: of the harmonics; those above the first are small noise.
         seed: of the places.
         vertices: of the skin, if not those of the mean shape [m], shape ``(V, 3)``.
+        inset: depth of the centres below the skin, over the size of a splat; training puts the edge of what is seen at
+            the skin, which reaches beyond the centres.
     """
     rng = np.random.default_rng(seed)
     skin = (asset.vertices if vertices is None else vertices).astype(np.float64)
@@ -37,6 +44,7 @@ def on_body(
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     turns = Rotation.from_matrix(np.stack([along, np.cross(normal, along), normal], axis=2))
     size = 0.75 * np.sqrt(area.sum() / count)
+    means -= inset * size * normal
     rest = asset.vertices[asset.faces[chosen, 0]]
     sh = np.zeros((count, COEFFICIENTS[degree], 3))
     sh[:, 0] = (_colors(rest) - 0.5) / harmonics([0.0, 0.0, 1.0], 0)

@@ -11,27 +11,32 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.asset import dense_weights, top_weights
 from piavatar_envs.avatar.body.sampling import ClosedSurface, sample_particles
+from piavatar_envs.avatar.body.skeleton import forward_kinematics, joint_index, skin
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.body.splats import SkinnedSplats
 from piavatar_envs.avatar.skinning import in_order, pack
 from piavatar_envs.core.arrays import vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
-from piavatar_envs.render.skin import SkinMotion, record_skin, skin_workspace
+from piavatar_envs.render.painter import Painter
+from piavatar_envs.render.skin import Skin, SkinMotion, record_skin, skin_workspace
 from piavatar_envs.render.splat_motion import STRETCH, BoundSplats, record_turns, stencils_of
+from piavatar_envs.render.splats import SplatPainter
+from piavatar_envs.render.surfaces import MeshPart, Surfaces
+from piavatar_envs.render.views import Shot, view_rows
 from tests.avatar.splat_clouds import on_body
 
 
 class Puppet:
     """Splats on a body whose bones and particles a test moves."""
 
-    def __init__(self, count: int, device: str) -> None:
+    def __init__(self, count: int, device: str, inset: float = 0.0) -> None:
         plain = load_asset()
-        cloud = on_body(plain, count)
+        cloud = on_body(plain, count, inset=inset)
         _, face, at = ClosedSurface(plain.vertices, plain.faces).query(cloud.means)
         dense = dense_weights(plain.skin_joints, plain.skin_weights)[plain.faces[face]]
         splats = SkinnedSplats(cloud, *top_weights(np.einsum("sc,scj->sj", at, dense)))
-        asset = dataclasses.replace(plain, look=dataclasses.replace(plain.drawn, splats=splats))
+        self.asset = asset = dataclasses.replace(plain, look=dataclasses.replace(plain.drawn, splats=splats))
         self.particles, self.device = sample_particles(plain, 0.05), device
         origin = asset.mean_body().joints[0] - asset.joints[0]
         self.rest = self.particles.rest_positions + origin
@@ -116,3 +121,44 @@ def test_directions_that_particles_do_not_span_are_bound_to_the_bones():
     # a turn of the bones that the line follows is found again
     turn = Rotation.from_rotvec([0.4, 0.0, 0.9]).as_matrix()
     np.testing.assert_allclose((line @ turn.T).T @ slope[0] + turn @ bound[0], turn, atol=1e-5)
+
+
+def silhouettes(puppet: Puppet, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of the skin's mesh and those of the splats, of a body with bent limbs."""
+    body, device = load_asset().mean_body(), puppet.device
+    local = np.tile(np.eye(3), (22, 1, 1))
+    local[joint_index("left_shoulder")] = Rotation.from_rotvec([0.0, -0.6, -0.5]).as_matrix()
+    local[joint_index("left_elbow")] = Rotation.from_rotvec([0.0, 0.0, -1.8]).as_matrix()
+    local[joint_index("right_knee")] = Rotation.from_rotvec([1.2, 0.0, 0.0]).as_matrix()
+    rotations, positions = forward_kinematics(local, puppet.joints[0], puppet.joints)
+    particles, cloud = puppet.particles, puppet.bound.cloud
+    skinning = particles.skin_joints, particles.skin_weights
+    x = skin(puppet.rest, *skinning, rotations, positions, puppet.joints)
+    means, covariances, turns = puppet.move(x, Rotation.from_matrix(rotations), positions)
+    mesh = Skin.baked(load_asset(), body, puppet.rest, *skinning).deform(rotations, positions, x)
+    shots = [Shot(np.array([1.5, -3.2, 1.4]), np.array([0.1, 0.0, 0.85]), 34.0, np.zeros(2))]
+    masks = []
+    for drawn in (True, False):
+        part = MeshPart(len(mesh), load_asset().faces, subject=1, is_drawn=drawn)
+        painter = Painter(Surfaces.build([part], device), 1, *size, device, segmentation=True)
+        painter.vertices.assign(mesh[None])
+        painter.views.assign(view_rows(shots, *size))
+        if not drawn:
+            over = SplatPainter(cloud.opacities, cloud.sh, 1, *size, device, subjects=np.ones(len(cloud)))
+            over.means.assign(means[None])
+            over.covariances.assign(covariances[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]][None])
+            over.turns.assign(turns.as_quat().astype(np.float32)[None])
+            painter.layers.append(over)
+        graph = LaunchGraph(device)
+        painter.record(graph)
+        graph.run()
+        masks.append(painter.labels.numpy()[0] == 1)
+    return masks[0], masks[1]
+
+
+def test_bent_limbs_have_no_holes(device):
+    """The mesh has none; splats whose centres are as deep as they are wide end where it does."""
+    mesh, splats = silhouettes(Puppet(50_000, device, inset=1.05), (480, 400))
+    assert mesh.sum() > 20_000
+    assert (mesh & splats).sum() > 0.995 * mesh.sum()
+    assert (mesh & splats).sum() > 0.98 * (mesh | splats).sum()

@@ -1,0 +1,113 @@
+"""Avatars of splats in environments: pictures, batches, games and exported frames."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights
+from piavatar_envs.avatar.body.sampling import ClosedSurface
+from piavatar_envs.avatar.body.sources import load_asset, register_source
+from piavatar_envs.avatar.body.splat_files import read_splats
+from piavatar_envs.avatar.body.splats import SkinnedSplats
+from piavatar_envs.config import load_config
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.export import Recording
+from piavatar_envs.render.painter import Painter
+from piavatar_envs.render.stage import Stage
+from piavatar_envs.render.views import Shot, view_rows
+from piavatar_envs.tasks.games import load_game_task
+from tests.avatar.splat_clouds import on_body
+from tests.render.batches import act
+
+COUNT = 700
+SPLATS = {"avatar.source": "splats_of_tests"}
+
+
+def _build() -> AvatarAsset:
+    """Return the embedded body, drawn as splats."""
+    plain = load_asset(appearance="skin")
+    cloud = on_body(plain, COUNT)
+    _, face, at = ClosedSurface(plain.vertices, plain.faces).query(cloud.means)
+    dense = dense_weights(plain.skin_joints, plain.skin_weights)[plain.faces[face]]
+    splats = SkinnedSplats(cloud, *top_weights(np.einsum("sc,scj->sj", at, dense)))
+    return dataclasses.replace(plain, look=dataclasses.replace(plain.drawn, splats=splats))
+
+
+@pytest.fixture(autouse=True)
+def source():
+    register_source("splats_of_tests", _build)
+
+
+def moved(stage: Stage) -> list[np.ndarray]:
+    """Return centres, covariances and rotations of all pictures."""
+    graph = LaunchGraph(stage.device)
+    stage.record(graph)
+    graph.run()
+    return [array.numpy().copy() for array in (stage.splats.means, stage.splats.covariances, stage.splats.turns)]
+
+
+@pytest.mark.parametrize("world", ["PIAvatar/Reach-v0", "PIAvatar/KickBall-v0"])
+def test_a_row_of_a_batch_is_the_environment_alone(world, make_batch, equal):
+    batch, alone = make_batch(world, 3, **SPLATS), make_batch(world, **SPLATS)
+    batch.reset(seeds=[7, 8, 9])
+    alone.reset(seeds=[8])
+    act(batch, 2)
+    act(alone, 2, rows=slice(1, 2))
+    every = moved(Stage(batch.simulation))
+    for single, all_rows in zip(moved(Stage(alone.simulation)), every, strict=True):
+        assert np.isfinite(all_rows).all() and equal(single[0], all_rows[1])
+    assert np.abs(every[0][0] - every[0][1]).max() > 1e-3
+
+
+def test_splats_stay_on_the_skin(make_batch):
+    batch = make_batch("PIAvatar/Reach-v0", **SPLATS)
+    batch.reset(seeds=[0])
+    act(batch, 2)
+    stage = Stage(batch.simulation)
+    means = moved(stage)[0][0]
+    part = stage.parts[0]
+    away = ClosedSurface(stage.vertices.numpy()[0, part.vertices], part.faces).distance(means)
+    assert np.abs(away).mean() < 0.002 and np.abs(away).max() < 0.02
+
+
+def test_pictures_show_splats_and_the_shadow_of_the_body(make_batch):
+    batch = make_batch("PIAvatar/Reach-v0", **SPLATS)
+    batch.reset(seeds=[0])
+    stage, size = Stage(batch.simulation), (96, 96)
+    labels = []
+    for layers in ([], stage.layers(*size)):
+        painter = Painter(stage.surfaces, 1, *size, stage.device, segmentation=True, vertices=stage.vertices)
+        shot = Shot(np.array([1.0, -3.4, 1.4]), np.array([0.0, 0.0, 0.9]), 34.0, np.zeros(2))
+        painter.views.assign(view_rows([shot], *size))
+        painter.layers += layers
+        graph = LaunchGraph(stage.device)
+        stage.record(graph)
+        painter.record(graph)
+        graph.run()
+        labels.append(painter.labels.numpy()[0])
+    assert not labels[0].any()  # the mesh is not seen
+    assert set(np.unique(labels[1])) == {0, 1} and (labels[1] == 1).sum() > 500
+
+
+def test_agents_of_a_game_have_splats_of_their_own(device, tmp_path):
+    task = load_game_task("sumo_v0")
+    batch = BatchEnv(task(load_config(task.Config, None, {"fidelity": "tiny", **SPLATS})), 1, device)
+    batch.reset(seeds=[0])
+    stage = Stage(batch.simulation)
+    means = moved(stage)[0][0]
+    assert stage.splats.slices == {0: slice(0, COUNT), 1: slice(COUNT, 2 * COUNT)}
+    assert np.linalg.norm(means[:COUNT].mean(axis=0) - means[COUNT:].mean(axis=0)) > 0.3
+    recording = Recording(SimpleNamespace(unwrapped=SimpleNamespace(batch=batch)), tmp_path / "film", "ply")
+    recording.add()
+    folders = {folder.name: folder for folder in recording.finish()}
+    for index, own in stage.splats.slices.items():
+        read = read_splats(folders[f"splats_{index}"] / "0000.ply")
+        np.testing.assert_allclose(read.means, means[own], atol=1e-5)
+        c = stage.splats.covariances.numpy()[0, own][:, [0, 3, 5]]
+        found = np.diagonal(read.covariances(), axis1=1, axis2=2)
+        np.testing.assert_allclose(found, c, atol=1e-3 * c.max())
