@@ -102,15 +102,18 @@ class Renderer:
         )
         splats = [body.splats for body in bodies if body.splats is not None]
         key = (tuple((id(faces), len(own)) for own, faces in meshes), tuple(id(each.cloud) for each in splats))
-        if self._shown is None or self._shown.key != key:
+        # A picture that is interrupted leaves samples behind: its painter is not used again.
+        shown, self._shown = self._shown, None
+        if shown is None or shown.key != key:
             parts = [MeshPart(len(own), faces) for own, faces in meshes]
             for index, body in enumerate(bodies):
                 parts[index] = replace(parts[index], is_drawn=body.splats is None)
             with CAPTURE.exclusive():
                 painter = Painter(Surfaces.build(parts, self._device), 1, self.height, self.width, self._device)
-                self._shown = _Shown(key, [mesh[1] for mesh in meshes], [each.cloud for each in splats], painter)
+                shown = _Shown(key, [mesh[1] for mesh in meshes], [each.cloud for each in splats], painter)
         with CAPTURE.shared():
-            picture = self._shown.draw(vertices, albedo, splats, shot)
+            picture = shown.draw(vertices, albedo, splats, shot)
+        self._shown = shown
         for body in bodies:
             if body.scalars is not None:
                 of_bodies = vertices[: sum(len(body.vertices) for body in bodies)]

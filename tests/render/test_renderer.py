@@ -125,6 +125,29 @@ def test_pictures_repeat(renderer, body):
     np.testing.assert_array_equal(renderer.render([body], markers), first)
 
 
+def test_an_interrupted_picture_leaves_nothing_behind(body, monkeypatch):
+    from piavatar_envs.core.launch_graph import LaunchGraph
+
+    armed, launches = [], LaunchGraph.launches.fget
+
+    def interrupt():
+        if armed:
+            raise KeyboardInterrupt
+
+    # before the samples become pixels
+    monkeypatch.setattr(
+        LaunchGraph, "launches", property(lambda graph: [*(own := launches(graph))[:-2], ("", interrupt), *own[-2:]])
+    )
+    there, gone = [shifted(body, (0.3, 0.0, 0.0))], [shifted(body, (50.0, 0.0, 0.0))]
+    with Renderer(SIZE, SIZE, camera=FIXED) as renderer:
+        empty = renderer.render(gone)
+        armed.append(True)
+        with pytest.raises(KeyboardInterrupt):
+            renderer.render(there)
+        armed.clear()
+        np.testing.assert_array_equal(renderer.render(gone), empty)
+
+
 def test_near_things_hide_far_ones(renderer, body):
     eye, middle = np.array(FIXED.position), np.array([0.0, -0.05, 1.15])
     toward = (eye - middle) / np.linalg.norm(eye - middle)
