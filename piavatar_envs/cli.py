@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from piavatar_envs.config import BodyColor
 from piavatar_envs.tasks import NAMESPACE, instead_of, listed_name
 
 EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")]
@@ -96,7 +97,7 @@ def play_command(
     ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
-    color: Annotated[Literal["skin", "strain"], tyro.conf.arg(help="colour of the body in the video")] = "skin",
+    color: Annotated[BodyColor, tyro.conf.arg(help="colour of the body in the video")] = "skin",
     avatar: AvatarFile = None,
     config: Overrides = (),
 ) -> None:
@@ -109,7 +110,7 @@ def play_command(
         steps: number of steps.
         seed: seed of the run.
         device: where to simulate.
-        color: skin or strain.
+        color: skin, strain, distortion or impulse.
         avatar: the body, instead of the package's own.
         config: overrides of the environment's configuration.
     """
@@ -158,7 +159,7 @@ def export_command(
     seed: Seed = 0,
     device: Device = "cpu",
     color: Annotated[
-        Literal["skin", "strain"], tyro.conf.arg(help="colour of the bodies; strain for ply and usd")
+        BodyColor, tyro.conf.arg(help="colour of the bodies; but skin for ply and usd only")
     ] = "skin",
     avatar: AvatarFile = None,
     config: Overrides = (),
@@ -173,7 +174,7 @@ def export_command(
         steps: number of steps.
         seed: seed of the run.
         device: where to simulate.
-        color: skin or strain.
+        color: skin, strain, distortion or impulse.
         avatar: the body, instead of the package's own.
         config: overrides of the environment's configuration.
     """

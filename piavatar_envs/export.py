@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from piavatar_envs.api.pictures import SceneReader
+from piavatar_envs.config import BodyColor
 from piavatar_envs.core.writing import check_writable
 from piavatar_envs.play import Rollout, check_agent, check_steps, frames, make, settings_of
 from piavatar_envs.render.film_files import check_format, film_writer
@@ -34,7 +35,7 @@ class Recording:
         folder: Path,
         kind: str = "glb",
         index: int = 0,
-        color: Literal["skin", "strain"] = "skin",
+        color: BodyColor = "skin",
     ) -> None:
         """Begin without a frame.
 
@@ -77,7 +78,7 @@ def export(
     steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
-    color: Literal["skin", "strain"] = "skin",
+    color: BodyColor = "skin",
     overrides: Mapping[str, Any] | None = None,
 ) -> tuple[Rollout, list[Path]]:
     """Play ``env_id`` as :func:`piavatar_envs.play.play` does, and write every state as a frame.

@@ -626,6 +626,10 @@ class SceneConfig(BaseModel):
     )
 
 
+#: Colours of bodies in pictures; see :mod:`piavatar_envs.render.quantities`.
+BodyColor = Literal["skin", "strain", "distortion", "impulse"]
+
+
 class RenderConfig(BaseModel):
     """Pictures of the scene; used only with a ``render_mode``."""
 
@@ -633,7 +637,13 @@ class RenderConfig(BaseModel):
 
     width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
     height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
-    color: Literal["skin", "strain"] = Field("skin", description="colour of the body: its skin, or its deformation")
+    color: BodyColor = Field(
+        "skin",
+        description="colour of the bodies of avatars: their own (skin); the largest change of a principal stretch "
+        "(strain); |F - R|, with the rotation R of the deformation gradient (distortion); or the impulse of other bodies "
+        "on the body part in the last control step (impulse)",
+    )
+    overlays: bool = Field(True, description="draw what is no matter: the task's markers, and the scale of colours")
     camera_position: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="position of the camera, from the ground below what it follows; null as the task has it [m]"
     )

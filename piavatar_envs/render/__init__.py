@@ -1,7 +1,7 @@
 """Pictures and videos. Pictures need no library but Warp; text on them and videos need the extra ``render``."""
 
-from piavatar_envs.render.coloring import strain_magnitude
 from piavatar_envs.render.overlay import label, side_by_side
+from piavatar_envs.render.quantities import distortion, strain_magnitude
 from piavatar_envs.render.renderer import Renderer
 from piavatar_envs.render.scene import (
     PALETTE,
@@ -37,6 +37,7 @@ __all__ = [
     "Skin",
     "Solid",
     "Sphere",
+    "distortion",
     "label",
     "side_by_side",
     "strain_magnitude",

@@ -1,4 +1,4 @@
-"""Colours: strain, a perceptually uniform map and its scale, and bodies in bands of one colour."""
+"""Colours: a perceptually uniform map and its scale, and bodies in bands of one colour."""
 
 from __future__ import annotations
 
@@ -20,27 +20,6 @@ NUM_BANDS = 16
 _STRAIN_ANCHORS = np.array(
     [[0.92, 0.025, 85.0], [0.79, 0.115, 66.0], [0.65, 0.190, 35.0], [0.51, 0.195, 10.0], [0.37, 0.150, -30.0]]
 )
-
-
-def strain_magnitude(deformation_gradient: ArrayLike) -> np.ndarray:
-    """Return the largest departure of a principal stretch from one: ``max_i |s_i - 1|``, zero for any rotation.
-
-    The principal stretches ``s_i`` are the singular values of ``F``; where ``det F < 0`` (inverted) the smallest is
-    counted as negative. An ``F`` that is not finite gives infinity.
-
-    Args:
-        deformation_gradient: ``F`` of each particle, shape ``(P, 3, 3)``.
-
-    Returns:
-        Strain [1], shape ``(P,)``.
-    """
-    gradient = np.asarray(deformation_gradient, dtype=np.float64)
-    finite = np.isfinite(gradient).all(axis=(-2, -1))
-    safe = np.where(finite[..., None, None], gradient, np.eye(3))
-    squared = np.linalg.eigvalsh(np.swapaxes(safe, -2, -1) @ safe)
-    stretches = np.sqrt(np.maximum(squared, 0.0))
-    stretches[..., 0] *= np.where(np.linalg.det(safe) < 0.0, -1.0, 1.0)
-    return np.where(finite, np.abs(stretches - 1.0).max(axis=-1), np.inf)
 
 
 @lru_cache(maxsize=1)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from piavatar_envs.render.quantities import QUANTITIES
+
 if TYPE_CHECKING:
     import viser
 
 SLOWEST, FASTEST = 0.1, 4.0
-COLORS = ("skin", "strain")
 
 
 class Panel:
@@ -18,7 +19,7 @@ class Panel:
     Attributes:
         playing: whether the simulation runs.
         speed: greatest ratio of simulated to real time.
-        color: of the bodies, ``"skin"`` or ``"strain"``.
+        color: of the bodies, ``"skin"`` or a name of :data:`~piavatar_envs.render.quantities.QUANTITIES`.
     """
 
     def __init__(self, server: viser.ViserServer, color: str = "skin") -> None:
@@ -35,7 +36,7 @@ class Panel:
         self._step = gui.add_button("Single step")
         self._begin = gui.add_button("New episode")
         self._speed = gui.add_slider("Speed", SLOWEST, FASTEST, 0.1, 1.0, hint="simulated over real time, at most")
-        self._color = gui.add_dropdown("Colour", COLORS, initial_value=color)
+        self._color = gui.add_dropdown("Colour", ("skin", *QUANTITIES), initial_value=color)
         self._text = gui.add_markdown("")
         self._play.on_click(lambda _event: self.play(not self.playing))
         self._step.on_click(lambda _event: self.request_step())
