@@ -158,9 +158,7 @@ def export_command(
     ] = None,
     seed: Seed = 0,
     device: Device = "cpu",
-    color: Annotated[
-        BodyColor, tyro.conf.arg(help="colour of the bodies; but skin for ply and usd only")
-    ] = "skin",
+    color: Annotated[BodyColor, tyro.conf.arg(help="colour of the bodies; but skin for ply and usd only")] = "skin",
     avatar: AvatarFile = None,
     config: Overrides = (),
 ) -> None:

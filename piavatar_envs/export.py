@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from piavatar_envs.api.pictures import SceneReader
 from piavatar_envs.config import BodyColor

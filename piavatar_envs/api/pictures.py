@@ -6,18 +6,17 @@ The renderer is imported when the first picture is drawn, so that environments w
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, body_part_of_joint
 from piavatar_envs.avatar.skinning import unpack
-from piavatar_envs.config import RenderConfig
-from piavatar_envs.core.arrays import matrices_of
+from piavatar_envs.config import BodyColor, RenderConfig
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from piavatar_envs.render import Arrow, Camera, Marker, MovedSplats, Scene
     from piavatar_envs.render.live import Drag, LiveView
     from piavatar_envs.render.stage import Stage
+    from piavatar_envs.sim.markers import MarkerSpec
 
 #: Render modes of one environment, and of a batch: a live view shows one.
 RENDER_MODES = ("rgb_array", "human")
@@ -90,19 +90,24 @@ class SceneReader:
         """The surfaces of one environment."""
         from piavatar_envs.render.stage import Stage
 
-        return Stage(self.batch.simulation, self.batch.task.marker_specs(), envs=[0])
+        return Stage(self.batch.simulation, self._specs, envs=[0])
+
+    @property
+    def _specs(self) -> Sequence[MarkerSpec]:
+        """Markers of the task that are drawn."""
+        return self.batch.task.marker_specs() if self.batch.config.render.overlays else ()
 
     @cached_property
     def _graph(self) -> LaunchGraph:
         """The launches that write the vertices of the stage."""
         graph, task = LaunchGraph(self.batch.simulation.device), self.batch.task
-        if task.marker_specs():
+        if self._specs:
             task.record_markers(self.batch, graph, self.stage.markers)
         self.stage.record(graph)
         return graph
 
-    def scene(self, env: int, color: Literal["skin", "strain"] = "skin") -> Scene:
-        """Describe the scene of environment ``env`` now, the bodies in their own colour or coloured by strain."""
+    def scene(self, env: int, color: BodyColor = "skin") -> Scene:
+        """Describe the scene of environment ``env`` now, the bodies in their own colours or coloured by a quantity."""
         from piavatar_envs.render import Body, Scene, Solid, Sphere
 
         simulation, task = self.batch.simulation, self.batch.task
@@ -114,12 +119,13 @@ class SceneReader:
         for part in self.stage.parts:
             own = vertices[part.vertices]
             if part.kind in ("avatar", "prop"):
-                strain = self._strain(env, len(bodies)) if color == "strain" and part.kind == "avatar" else None
+                scalars = self._scalars(env, len(bodies), color)
                 splats = self._splats(len(bodies)) if color == "skin" and part.kind == "avatar" else None
-                bodies.append(Body(own, part.faces, part.color, part.colors, scalars=strain, splats=splats))
+                bodies.append(Body(own, part.faces, part.color, part.colors, splats=splats, **scalars))
             elif np.isfinite(own[0, 0]):  # hidden ones are NaN
                 markers.append(Solid(part.kind, own, part.faces, part.color))
-        markers += [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
+        if self.batch.config.render.overlays:
+            markers += [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in simulation.avatars]
         follow = np.mean(roots, axis=0) if task.camera_follows else None
         return Scene(bodies, markers, follow)
@@ -129,13 +135,20 @@ class SceneReader:
         splats = self.stage.splats
         return None if splats is None or index not in splats.bound else splats.moved(0, index)
 
-    def _strain(self, env: int, index: int) -> np.ndarray:
-        """Return the strain of an avatar at its vertices."""
-        from piavatar_envs.render import strain_magnitude
+    def _scalars(self, env: int, body: int, color: BodyColor) -> dict[str, Any]:
+        """Return the fields of a body in the scene that colour it by a quantity; none if it has its own colours."""
+        from piavatar_envs.render.quantities import QUANTITIES, of_particles
 
-        body = self.batch.simulation.avatars[index].body
-        F = matrices_of(self.batch.simulation.state.F.numpy()[env])[body.first : body.first + body.count]
-        return self.stage.skins[index].interpolate(strain_magnitude(F))
+        simulation, avatars = self.batch.simulation, len(self.stage.skins)
+        if color == "skin" or (color == "impulse" and body >= avatars):
+            return {}
+        if body < avatars:
+            matter, surface = simulation.avatars[body].body, self.stage.skins[body]
+        else:
+            matter, surface = simulation.props.props[body - avatars], self.stage.solids[body - avatars]
+        own, scale = slice(matter.first, matter.first + matter.count), QUANTITIES[color]
+        scalars = surface.interpolate(of_particles(simulation, env, own, color))
+        return {"scalars": scalars, "scalar_max": scale.maximum, "scalar_label": scale.label}
 
 
 class Progress:
@@ -180,7 +193,7 @@ class Picture:
         from piavatar_envs.render import Renderer
 
         self.config = config
-        self.renderer = Renderer(config.width, config.height, camera_of(batch))
+        self.renderer = Renderer(config.width, config.height, camera_of(batch), scale=config.overlays)
         self._scenes = SceneReader(batch)
 
     def cut(self) -> None:
@@ -385,7 +398,7 @@ class Live:
     The server starts with the first scene.
 
     Attributes:
-        color: of the bodies, ``"skin"`` or ``"strain"``; may be changed at any time.
+        color: of the bodies, ``"skin"`` or a quantity; may be changed at any time.
         pace: holds the steps back.
     """
 
@@ -393,7 +406,7 @@ class Live:
         self,
         batch: BatchEnv,
         push: Callable[..., None],
-        color: Literal["skin", "strain"] = "skin",
+        color: BodyColor = "skin",
         port: int | None = None,
         env: int = 0,
         pace: Pace | None = None,

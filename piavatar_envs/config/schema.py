@@ -640,8 +640,8 @@ class RenderConfig(BaseModel):
     color: BodyColor = Field(
         "skin",
         description="colour of the bodies of avatars: their own (skin); the largest change of a principal stretch "
-        "(strain); |F - R|, with the rotation R of the deformation gradient (distortion); or the impulse of other bodies "
-        "on the body part in the last control step (impulse)",
+        "(strain); |F - R|, with the rotation R of the deformation gradient F (distortion); or the impulse of other "
+        "bodies on the body part in the last control step (impulse)",
     )
     overlays: bool = Field(True, description="draw what is no matter: the task's markers, and the scale of colours")
     camera_position: tuple[Coordinate, Coordinate, Coordinate] | None = Field(

@@ -13,6 +13,7 @@ from piavatar_envs.config.schema import AvatarConfig, PropConfig
 FIELD_OF_VIEW, MARGIN = 29.0, 0.06
 #: Height and radius of the spheres that hold a standing adult with hands half raised, from head to feet [m].
 _STANDING = ((1.60, 0.24), (1.05, 0.62), (0.20, 0.36))
+_NEAREST = 0.1  # distance of the eye from anything [m]
 
 #: A place and the distance around it that is shown: x, y, z and radius [m].
 Sphere = tuple[float, float, float, float]
@@ -57,13 +58,32 @@ def frame(
     axes = np.stack([right, np.cross(right, forward), forward])
     seen, radius = place[:, :3] @ axes.T, place[:, 3]
     half = math.tan(math.radians(0.5 * FIELD_OF_VIEW)) * (1.0 - 2.0 * MARGIN)
-    eye = np.empty(3)
-    depths = []
-    for axis, slope in enumerate((half * min(aspect, 1.0), half)):
+    slopes = (half * min(aspect, 1.0), half)
+    bounds = []
+    for axis, slope in enumerate(slopes):
         reach = radius * math.hypot(1.0, slope) - slope * seen[:, 2]
-        high, low = (seen[:, axis] + reach).max(), (reach - seen[:, axis]).max()
-        eye[axis] = 0.5 * (high - low)
-        depths.append(-0.5 * (high + low) / slope)
-    eye[2] = min(*depths, (seen[:, 2] - radius).min() - 0.1)
+        bounds.append(((seen[:, axis] + reach).max(), (reach - seen[:, axis]).max()))
+    eye = np.empty(3)
+    eye[2] = min(-0.5 * sum(bound) / slope for bound, slope in zip(bounds, slopes, strict=True))
+    eye[2] = min(eye[2], (seen[:, 2] - radius).min() - _NEAREST)
+    for axis, (slope, (high, low)) in enumerate(zip(slopes, bounds, strict=True)):
+        eye[axis] = _middle(
+            seen[:, axis],
+            radius * math.hypot(1.0, slope),
+            seen[:, 2] - eye[2],
+            high + slope * eye[2],
+            -low - slope * eye[2],
+        )
     target = np.array([eye[0], eye[1], seen[:, 2].mean()])
     return tuple((eye @ axes).round(3).tolist()), tuple((target @ axes).round(3).tolist())
+
+
+def _middle(place: np.ndarray, radius: np.ndarray, depth: np.ndarray, low: float, high: float) -> float:
+    """Return the eye's place aside, within bounds, from which what is seen has equal margins on both sides."""
+    for _ in range(40):
+        eye = 0.5 * (low + high)
+        if ((place + radius - eye) / depth).max() + ((place - radius - eye) / depth).min() > 0.0:
+            low = eye
+        else:
+            high = eye
+    return 0.5 * (low + high)

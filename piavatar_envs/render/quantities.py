@@ -77,13 +77,12 @@ def distortion(deformation_gradient: ArrayLike) -> np.ndarray:
     return np.linalg.norm(principal_stretches(deformation_gradient) - 1.0, axis=-1)
 
 
-def of_particles(simulation: Simulation, env: int, avatar: int, name: str) -> np.ndarray:
-    """Return one of :data:`QUANTITIES` of the particles of an avatar in environment ``env`` now, shape ``(P,)``.
+def of_particles(simulation: Simulation, env: int, own: slice, name: str) -> np.ndarray:
+    """Return one of :data:`QUANTITIES` of some particles in environment ``env`` now, shape ``(P,)``.
 
-    The impulse is that of all other bodies, in the last control step, on the body part that a particle is in.
+    The impulse is that of all other bodies, in the last control step, on the body part that a particle is in. Only
+    avatars have parts.
     """
-    body = simulation.avatars[avatar].body
-    own = slice(body.first, body.first + body.count)
     if name == "impulse":
         impulse = np.linalg.norm(simulation.sensors.part_impulse.numpy()[env].sum(axis=1), axis=-1)
         return impulse[simulation.model.particles.sensor.numpy()[own]]

@@ -36,7 +36,12 @@ class Renderer:
     """
 
     def __init__(
-        self, width: int = 480, height: int = 480, camera: Camera | None = None, device: str | wp.Device = "cpu"
+        self,
+        width: int = 480,
+        height: int = 480,
+        camera: Camera | None = None,
+        device: str | wp.Device = "cpu",
+        scale: bool = True,
     ) -> None:
         """Prepare pictures of one size; nothing is allocated before the first.
 
@@ -45,6 +50,7 @@ class Renderer:
             height: of the picture [px].
             camera: the view; by default of a standing person, three-quarters from the front.
             device: Warp device to draw on. A GPU is for the process that first used it.
+            scale: draw the colour scale of bodies that have scalars.
 
         Raises:
             ValueError: a size outside [16, 8192].
@@ -55,7 +61,7 @@ class Renderer:
         init_warp()
         self.width, self.height = int(width), int(height)
         self.camera = camera or Camera()
-        self._device = device
+        self._device, self._scale = device, scale
         self._follower = Follower(self.camera)
         self._corner = 0  # of the colour scale
         self._shown: _Shown | None = None
@@ -115,7 +121,7 @@ class Renderer:
             picture = shown.draw(vertices, albedo, splats, shot)
         self._shown = shown
         for body in bodies:
-            if body.scalars is not None:
+            if body.scalars is not None and self._scale:
                 of_bodies = vertices[: sum(len(body.vertices) for body in bodies)]
                 seen = shot.project(of_bodies, self.height, self.width)
                 self._corner = draw_scale(picture, body.scalar_max, body.scalar_label, seen, self._corner)

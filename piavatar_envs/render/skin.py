@@ -476,6 +476,10 @@ class SolidSurface:
         weight = 1.0 / np.maximum(distance, 1e-6) ** 2
         self._weight = weight / weight.sum(axis=1, keepdims=True)
 
+    def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
+        """Interpolate a quantity of the particles on the surface, shape ``(P,)`` to ``(V,)``."""
+        return (self._weight * np.asarray(per_particle, np.float64)[self._near]).sum(axis=1)
+
     def upload(self, device: str) -> PropSurface:
         """Return the constants on a device."""
 

@@ -78,7 +78,7 @@ class Stage:
         envs: environment of each picture, ``(num_pictures,)`` int32.
         parts: what stands there, in the order of the vertices.
         subjects: names by label: the ground, avatars, props, colliders, and all markers together.
-        skins: the skin of every avatar.
+        skins, solids: the surfaces of every avatar and prop.
         splats: the splats of all avatars that are drawn as such; None without any.
         vertices: in the world [m], ``(num_pictures, vertices)``; NaN of a marker that is hidden.
         markers: of all environments, where they are; written by the task.
@@ -105,7 +105,7 @@ class Stage:
         solids = tuple(simulation.subjects.collider_names[i] for i in self._colliders)
         self.subjects = ("ground", *names, *solids, *([MARKERS] if markers else []))
         self.skins = [self._bake(index) for index in range(len(simulation.avatars))]
-        self._solids = [SolidSurface(own.rest, own.vertices, own.faces) for own in simulation.props.points]
+        self.solids = [SolidSurface(own.rest, own.vertices, own.faces) for own in simulation.props.points]
         self._list_parts(names, markers)
         count = self.parts[-1].vertices.stop if self.parts else 0
         self.vertices = wp.zeros((self.num_pictures, count), dtype=wp.vec3, device=self.device)
@@ -157,7 +157,7 @@ class Stage:
             drawn = flesh.asset.drawn
             color = PALETTE[index % len(PALETTE)]
             self._add(names[index], "avatar", len(drawn.vertices), drawn.faces, color, drawn.colors_of(index))
-        for name, solid in zip(names[avatars:], self._solids, strict=True):
+        for name, solid in zip(names[avatars:], self.solids, strict=True):
             self._add(name, "prop", len(solid.vertices), solid.faces, PROP)
         for collider in self._colliders:
             kind, name = simulation.subjects.colliders[collider].kind, simulation.subjects.collider_names[collider]
@@ -183,7 +183,7 @@ class Stage:
         for avatar in range(len(self.skins)):
             self._record_skin(graph, avatar, next(first))
         props, x = self.simulation.props, self.simulation.state.x
-        for column, (prop, solid) in enumerate(zip(props.props, self._solids, strict=True)):
+        for column, (prop, solid) in enumerate(zip(props.props, self.solids, strict=True)):
             inputs = [self.envs, solid.upload(self.device), prop.first, column, props.state.position]
             inputs += [props.state.rotation, x, next(first)]
             graph.launch(deform_prop, (self.num_pictures, len(solid.vertices)), inputs, [self.vertices])

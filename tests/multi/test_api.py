@@ -390,7 +390,8 @@ def test_a_game_is_watched_and_pettingzoos_render_test_passes(fresh, play):
     game = fresh(GAME).parallel_env(render_mode="human")
     game.reset(seed=0)
     view = game.host.live.view
-    bodies = [f"/world/body_{index}" for index in range(len(game.possible_agents))]
+    # a band of one colour of each
+    bodies = [f"/world/body_{index}_band_0" for index in range(len(game.possible_agents))]
     before = [view._nodes[name].vertices.copy() for name in bodies]
     play(game, 2, np.random.default_rng(0))
     assert game.render() is None

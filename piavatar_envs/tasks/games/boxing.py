@@ -34,8 +34,11 @@ from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action
 
 wp.set_module_options({"enable_backward": False})
 
-#: Heights of the marks at the corners of the ring, and their radius [m].
-POSTS, MARKER = (0.0, 0.45, 0.9, 1.35), 0.03
+#: Height of the posts of the ring, and of its ropes; radii of both [m].
+TOP, ROPES, POST, ROPE = 1.3, (0.45, 0.85, 1.25), 0.04, 0.012
+RED, DARK = (0.75, 0.20, 0.20), (0.22, 0.23, 0.26)
+#: Turns of a rope from the z axis, wxyz.
+ALONG_X, ALONG_Y = (0.5**0.5, 0.0, 0.5**0.5, 0.0), (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
 _PARTS = tuple(BODY_PARTS)
 _HEAD, _TORSO = wp.constant(_PARTS.index("head")), wp.constant(_PARTS.index("torso"))
 _LEFT_ARM, _RIGHT_ARM = wp.constant(_PARTS.index("left_arm")), wp.constant(_PARTS.index("right_arm"))
@@ -259,7 +262,7 @@ for it to stay up. A good agent strikes fast, at the head, and withdraws."""
     def shown(self) -> list[Sphere]:
         """Return avatars and ropes."""
         side = 0.5 * self.config.ring_size
-        corners = [(x, y, z, MARKER) for x in (-side, side) for y in (-side, side) for z in POSTS]
+        corners = [(x, y, z, POST) for x in (-side, side) for y in (-side, side) for z in (0.0, TOP)]
         return super().shown() + corners
 
     def domain(self) -> Domain:
@@ -280,10 +283,17 @@ for it to stay up. A good agent strikes fast, at the head, and withdraws."""
         graph.launch(judge, agents, inputs, [env.outcome])
 
     def marker_specs(self) -> tuple[MarkerSpec, ...]:
-        """Return the posts of the ring, each a column of balls."""
-        side = 0.5 * self.config.ring_size
-        corners = [(x, y, z) for x in (-side, side) for y in (-side, side) for z in POSTS]
-        return tuple(MarkerSpec("sphere", (MARKER,), (0.75, 0.20, 0.20), corner) for corner in corners)
+        """Return the posts at the corners of the ring, and its ropes."""
+        side, half = 0.5 * self.config.ring_size, 0.5 * TOP
+        corners = [(x, y) for x in (-side, side) for y in (-side, side)]
+        posts = [MarkerSpec("capsule", (POST, half - POST), DARK, (x, y, half)) for x, y in corners]
+        ropes = [
+            MarkerSpec("capsule", (ROPE, side), RED, place, turn)
+            for height in ROPES
+            for at in (-side, side)
+            for place, turn in (((at, 0.0, height), ALONG_Y), ((0.0, at, height), ALONG_X))
+        ]
+        return (*posts, *ropes)
 
 
 TASK = BoxingTask
