@@ -109,6 +109,23 @@ def with_shape(surface: SkinSurface, shape: wp.array2d(dtype=float), e: int, v: 
     return rest
 
 
+@wp.func_native("""
+wp::vec3 sum;
+const int columns = near.shape[1];
+const wp::vec3* const from = values.data + wp::int64(values.shape[1]) * i;
+for (int k = 0; k < near.shape[0]; ++k) {
+    const int at = columns * k + v;
+    sum = wp::add(sum, wp::mul(weight.data[at], from[near.data[at]]));
+}
+return sum;
+""")
+def weighted_sum(
+    near: wp.array2d(dtype=int), weight: wp.array2d(dtype=float), values: wp.array2d(dtype=wp.vec3), i: int, v: int
+) -> wp.vec3:
+    """Return ``sum_k weight[k, v] values[i, near[k, v]]``."""
+    ...
+
+
 @wp.kernel
 def pose_skin(envs: wp.array(dtype=int), surface: SkinSurface, motion: SkinMotion, workspace: SkinWorkspace):
     """Write the pose of the bones of every picture, over ``(pictures, bones)``."""
@@ -172,9 +189,7 @@ def deform_skin(
                 at_change = ((b - 1) * 9 + d) * TILE + v % TILE
                 rest += change[d / 3, d % 3] * surface.directions[v / TILE, at_change]
     at = blend_places(workspace.place, i, surface.skin, v, rest)
-    for k in range(surface.near.shape[0]):
-        at += surface.weight[k, v] * workspace.displacement[i, surface.near[k, v]]
-    vertices[i, first + v] = at
+    vertices[i, first + v] = at + weighted_sum(surface.near, surface.weight, workspace.displacement, i, v)
 
 
 def record_skin(
@@ -269,7 +284,7 @@ class Skin:
         self._interpolation = interpolation_matrix(self._rest, own, self._particles, others, NUM_NEIGHBOURS)
         self._pose: PoseDisplacements | None = getattr(asset, "pose", None)
         self._correctives = correctives if self._pose is not None else None
-        self._uploaded: dict[tuple[str, int | None], SkinSurface] = {}
+        self._uploaded: dict[tuple[str, int], tuple[AvatarAsset | None, SkinSurface]] = {}
 
     @classmethod
     def baked(
@@ -314,10 +329,10 @@ class Skin:
 
     def upload(self, device: str, varying: AvatarAsset | None = None) -> SkinSurface:
         """Return the constants on a device, uploaded once; where shapes differ, with the shapes of an asset."""
-        key = (device, None if varying is None else id(varying))
+        key = (device, id(varying))
         if key not in self._uploaded:
-            self._uploaded[key] = self._upload(device, varying)
-        return self._uploaded[key]
+            self._uploaded[key] = varying, self._upload(device, varying)  # an id is only unique while its owner lives
+        return self._uploaded[key][1]
 
     def _upload(self, device: str, varying: AvatarAsset | None) -> SkinSurface:
         count, neighbours = self.num_vertices, self._interpolation.indices.reshape(self.num_vertices, -1)

@@ -1,6 +1,8 @@
 """The stage: all surfaces of a simulation, computed on its device for any number of its environments.
 
 What stands there never changes: avatars, soft props, the scene's colliders, then the task's markers. Only vertices do.
+They take 12 bytes each a picture, and the particles right beneath a skin as much: some 0.23 MB a picture of the
+embedded body, 0.24 GB of 1,024. All else is shared by the pictures.
 """
 
 from __future__ import annotations
