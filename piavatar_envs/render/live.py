@@ -10,15 +10,17 @@ import sys
 import weakref
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from types import ModuleType
 from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
+from piavatar_envs.avatar.body.splats import SplatCloud, harmonics
 from piavatar_envs.core.extras import missing
 from piavatar_envs.render import ground
 from piavatar_envs.render.coloring import bands_of, strain_table
-from piavatar_envs.render.scene import Camera, Color, Follower, Scene
+from piavatar_envs.render.scene import Camera, Color, Follower, MovedSplats, Scene
 from piavatar_envs.render.shading import KEY
 
 if TYPE_CHECKING:
@@ -36,6 +38,8 @@ _GROUND_SIZE = 40.0
 _STYLE = ground.GroundStyle()
 #: Farther than this from the origin nothing is drawn [m].
 _FAR = 50.0
+#: Lengths of splats that are sent over those that are shown; and the largest number of half precision.
+_SPLAT_SCALE, _LARGEST = 10.0, 65504.0
 #: A warm sun, a cool sky and what the ground gives back, as in the pictures; bytes.
 _KEY_LIGHT, _SKY_LIGHT, _GROUND_LIGHT = (255, 243, 226), (216, 228, 250), (206, 186, 170)
 
@@ -105,7 +109,7 @@ class LiveView:
         check_port(port)
         library = import_viser()
         self._follower = Follower(camera or Camera())
-        self._nodes: dict[str, viser.MeshHandle] = {}
+        self._nodes: dict[str, viser.MeshHandle | viser.GaussianSplatHandle] = {}
         self.drag: Drag | None = None
         with _silence():
             self.server: viser.ViserServer = library.ViserServer(HOST, port, "piavatar-envs", verbose=False)
@@ -160,14 +164,17 @@ class LiveView:
             self._follower.cut()
         center = self._follower.move(scene.follow, elapsed or 0.0)
         shown = dict(_meshes(scene))
+        splats = {f"{_WORLD}/body_{i}_splats": body.splats for i, body in enumerate(scene.bodies) if body.splats}
         with self.server.atomic():
             self._world.position = (*-center, 0.0)
             # a ground that repeats may stay below the camera for ever
             self._ground.position = (*-np.mod(center, 2.0 * ground.SQUARE), ground.HEIGHT)
-            for name in self._nodes.keys() - shown.keys():
+            for name in self._nodes.keys() - shown.keys() - splats.keys():
                 self._nodes.pop(name).remove()
             for name, (vertices, faces, color) in shown.items():
                 self._place(name, _drawable(vertices), faces, _bytes(color))
+            for name, moved in splats.items():
+                self._place_splats(name, pack_splats(moved))
         strained = [body for body in scene.bodies if body.scalars is not None]
         if strained:
             self._scale.label = f"{strained[0].scalar_label}, 0 to {strained[0].scalar_max:g}"
@@ -177,12 +184,23 @@ class LiveView:
         """Add or update a mesh; the library sends changes only."""
         node = self._nodes.get(name)
         if node is None:
-            self._nodes[name] = node = self.server.scene.add_mesh_simple(name, vertices, faces, color=color)
-            body = _BODY.match(name)
-            if body:
-                node.on_drag("left", modifier=DRAG_KEYS)(_follower(weakref.WeakMethod(self._follow), int(body[1])))
+            self._add(name, self.server.scene.add_mesh_simple(name, vertices, faces, color=color))
             return
         node.vertices, node.faces, node.color = vertices, faces, color
+
+    def _place_splats(self, name: str, packed: np.ndarray) -> None:
+        """Add or update splats, from :func:`pack_splats`."""
+        if name not in self._nodes:
+            none = np.zeros((1, 3)), np.zeros((1, 3, 3)), np.zeros((1, 3)), np.zeros((1, 1))
+            self._add(name, self.server.scene.add_gaussian_splats(name, *none, scale=1.0 / _SPLAT_SCALE))
+        self._nodes[name].buffer = packed
+
+    def _add(self, name: str, node: viser.MeshHandle | viser.GaussianSplatHandle) -> None:
+        """Keep a new node, which the mouse may drag if it is a body."""
+        self._nodes[name] = node
+        body = _BODY.match(name)
+        if body:
+            node.on_drag("left", modifier=DRAG_KEYS)(_follower(weakref.WeakMethod(self._follow), int(body[1])))
 
     async def _follow(self, body: int, event: viser.SceneNodeDragEvent) -> None:
         """Keep what the mouse drags; a coroutine, because the library runs other functions in any order."""
@@ -225,6 +243,8 @@ def _meshes(scene: Scene) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, C
     """Yield name, vertices, triangles and colour of everything in a scene; names persist between scenes."""
     for index, body in enumerate(scene.bodies):
         name = f"{_WORLD}/body_{index}"
+        if body.splats is not None:
+            continue
         if body.scalars is None and body.colors is None:
             yield name, (body.vertices, body.faces, body.color)
             continue
@@ -233,6 +253,29 @@ def _meshes(scene: Scene) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, C
     for index, marker in enumerate(scene.markers):
         vertices, faces = marker.mesh()
         yield f"{_WORLD}/{marker.kind}_{index}", (vertices, faces, marker.color)
+
+
+def pack_splats(splats: MovedSplats) -> np.ndarray:
+    """Return splats as browsers take them, :data:`_SPLAT_SCALE` times as large, shape ``(S, 8)`` uint32.
+
+    A row has the centre as single and the covariance as half precision, and the colour as bytes, the mean over all
+    directions. Covariances of splats of millimetres in metres would be zero in half precision.
+    """
+    packed = np.zeros((len(splats.means), 8), np.uint32)
+    packed[:, :3] = np.ascontiguousarray(np.float32(_SPLAT_SCALE) * _drawable(splats.means)).view(np.uint32)
+    covariances = np.nan_to_num(np.asarray(splats.covariances, np.float32) * _SPLAT_SCALE**2, posinf=0.0, neginf=0.0)
+    halves = np.ascontiguousarray(np.clip(covariances, -_LARGEST, _LARGEST), np.float16)
+    packed[:, 4:7] = halves.view(np.uint32)
+    packed[:, 7] = _tint(splats.cloud)
+    return packed
+
+
+@lru_cache(maxsize=16)
+def _tint(cloud: SplatCloud) -> np.ndarray:
+    """Return colours and opacities as bytes, four in one number, shape ``(S,)`` uint32."""
+    colors = 0.5 + harmonics(np.array([0.0, 0.0, 1.0]), 0) * cloud.sh[:, 0]
+    rgba = np.concatenate([colors, cloud.opacities[:, None]], axis=1)
+    return np.rint(255.0 * np.clip(rgba, 0.0, 1.0)).astype(np.uint8).view(np.uint32)[:, 0]
 
 
 def _bytes(color: Color) -> tuple[int, int, int]:

@@ -8,14 +8,17 @@ import socket
 import sys
 import urllib.request
 import weakref
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from piavatar_envs.render import Arrow, Body, Camera, Scene, Sphere
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.render import Arrow, Body, Camera, MovedSplats, Scene, Sphere
 from piavatar_envs.render.coloring import NUM_BANDS, bands_of, color_by
 from piavatar_envs.render.live import LiveView
+from tests.avatar.splat_clouds import on_body
 
 GREEN = (0.0, 1.0, 0.0)
 
@@ -57,6 +60,28 @@ def test_everything_in_the_scene_is_shown(view, body):
     assert shown.color == (0, 255, 0) and not shown.flat_shading
     for name, marker in (("sphere_0", markers[0]), ("arrow_1", markers[1])):
         np.testing.assert_allclose(handle(view, name).vertices, marker.mesh()[0], atol=1e-6)
+
+
+def test_splats_are_shown_instead_of_the_mesh(view, body):
+    cloud = on_body(load_asset(), 200)
+    covariances = cloud.covariances()[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].astype(np.float32)
+    splats = MovedSplats(cloud, cloud.means, covariances, cloud.rotations)
+    view.show(Scene([replace(body, splats=splats)], []), None)
+    assert names(view) == {"body_0_splats"}
+    shown = handle(view, "body_0_splats")
+    scale = np.asarray(shown.scale)
+    np.testing.assert_allclose(shown.centers * scale, cloud.means, atol=1e-6)
+    # splats of millimetres keep their shapes in half precision
+    packed = np.ascontiguousarray(shown.buffer[:, 4:7]).view(np.float16).astype(float) * scale**2
+    np.testing.assert_allclose(packed, covariances, atol=2e-3 * covariances.max(), rtol=2e-3)
+    expected = np.rint(255.0 * np.clip(0.5 + 0.28209479 * cloud.sh[:, 0], 0.0, 1.0))
+    np.testing.assert_allclose(shown.buffer[:, 7].copy().view(np.uint8).reshape(-1, 4)[:, :3], expected, atol=1)
+    moved = MovedSplats(cloud, cloud.means + np.float32(0.25), np.full_like(covariances, np.nan), cloud.rotations)
+    view.show(Scene([replace(body, splats=moved)], []), 0.1)
+    assert handle(view, "body_0_splats") is shown
+    np.testing.assert_allclose(shown.centers * scale, moved.means, atol=1e-6)
+    view.show(Scene([body], []), 0.1)
+    assert names(view) == {"body_0"}
 
 
 def test_meshes_are_moved_and_not_made_anew(view, body):
