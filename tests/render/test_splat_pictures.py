@@ -1,0 +1,96 @@
+"""Pictures of avatars of splats: of one environment and of many, and silhouettes beside those of the mesh."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from piavatar_envs.api.pictures import SceneReader
+from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights
+from piavatar_envs.avatar.body.sampling import ClosedSurface
+from piavatar_envs.avatar.body.sources import load_asset, register_source
+from piavatar_envs.avatar.body.splats import SkinnedSplats
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render.cameras import BatchCamera
+from piavatar_envs.render.painter import Painter
+from piavatar_envs.render.scene import Camera
+from piavatar_envs.render.stage import Stage
+from piavatar_envs.render.surfaces import MeshPart, Surfaces
+from tests.avatar.splat_clouds import on_body
+from tests.render.batches import act
+
+SPLATS = {"avatar.source": "body_of_splats"}
+
+
+def with_splats(count: int) -> AvatarAsset:
+    """Return the embedded body with splats on its skin."""
+    plain = load_asset(appearance="skin")
+    cloud = on_body(plain, count)
+    _, face, at = ClosedSurface(plain.vertices, plain.faces).query(cloud.means)
+    dense = dense_weights(plain.skin_joints, plain.skin_weights)[plain.faces[face]]
+    splats = SkinnedSplats(cloud, *top_weights(np.einsum("sc,scj->sj", at, dense)))
+    return dataclasses.replace(plain, look=dataclasses.replace(plain.drawn, splats=splats))
+
+
+register_source("body_of_splats", lambda count=20_000: with_splats(count))
+
+
+class Pictures:
+    """Pictures of some environments of a batch, with labels."""
+
+    def __init__(self, batch, envs, size: int = 64, meshes: bool = False) -> None:
+        stage = Stage(batch.simulation, batch.task.marker_specs(), envs)
+        shown = [MeshPart(part.num_vertices, part.faces, subject=part.subject) for part in stage.parts]
+        surfaces = Surfaces.build(shown, batch.device) if meshes else stage.surfaces
+        self.painter = Painter(
+            surfaces, len(envs), size, size, batch.device, depth=True, segmentation=True, vertices=stage.vertices
+        )
+        if not meshes:
+            self.painter.layers += stage.layers(size, size)
+        out = self.painter.views, self.painter.centers
+        camera = BatchCamera(batch.simulation, Camera(), size, size, stage.envs, out=out)
+        self._graph = LaunchGraph(batch.device)
+        batch.task.record_markers(batch, self._graph, stage.markers)
+        stage.record(self._graph)
+        camera.record(self._graph)
+        self.painter.record(self._graph)
+
+    def take(self) -> tuple[np.ndarray, ...]:
+        """Return pictures, depths and labels."""
+        self._graph.run()
+        return tuple(array.numpy().copy() for array in (self.painter.picture, self.painter.depth, self.painter.labels))
+
+
+def test_rows_of_a_batch_equal_pictures_alone(make_batch, equal):
+    batch = make_batch("PIAvatar/KickBall-v0", 3, **SPLATS)
+    batch.reset(seeds=[7, 8, 9])
+    act(batch, 3)
+    every = Pictures(batch, [0, 1, 2]).take()
+    for env in range(3):
+        for a, b in zip(every, Pictures(batch, [env]).take(), strict=True):
+            assert equal(a[env], b[0])
+    picture, depth, labels = every
+    assert {1, 2} <= set(np.unique(labels))  # the avatar, and the ball
+    red, green, _ = picture[labels == 1].astype(int).T
+    assert (red > green + 60).mean() > 0.1  # stripes of the shirt
+    assert 2.0 < np.median(depth[labels == 1]) < 6.0
+
+
+def test_a_bent_arm_has_no_holes(make_batch):
+    batch = make_batch("PIAvatar/Reach-v0", **SPLATS)
+    batch.reset(seeds=[3])
+    act(batch, 12, rows=slice(0, 1))
+    drawn, covered = (Pictures(batch, [0], 320, meshes).take()[2][0] == 1 for meshes in (True, False))
+    assert (drawn & covered).sum() >= 0.98 * drawn.sum()
+    assert binary_dilation(drawn, iterations=3)[covered].all()  # splats reach a pixel or two beyond
+
+
+def test_render_draws_splats_unless_colours_are_strain(make_env):
+    env = make_env("PIAvatar/Reach-v0", render_mode="rgb_array", **SPLATS, **{"render.width": 64, "render.height": 64})
+    env.reset(seed=3)
+    red, green, _ = env.render().astype(int).reshape(-1, 3).T
+    assert (red > green + 60).sum() > 60
+    strained = SceneReader(env.batch).scene(0, "strain").bodies[0]
+    assert strained.splats is None and strained.scalars is not None
