@@ -181,6 +181,12 @@ class Stage:
         """Append the launches that write the vertices of all pictures from the present state."""
         if self.splats is not None:
             self.splats.record(graph)
+        graph.parallel(self._launches)
+
+    @cached_property
+    def _launches(self) -> LaunchGraph:
+        """The launches for surfaces, which all graphs share with what they work in."""
+        graph = LaunchGraph(self.device)
         first = iter([part.vertices.start for part in self.parts])
         for avatar in range(len(self.skins)):
             self._record_skin(graph, avatar, next(first))
@@ -196,6 +202,7 @@ class Stage:
         if self._specs:
             meshes = upload_meshes([s.kind for s in self._specs], [s.size for s in self._specs], self.device)
             self._record_solids(graph, meshes, self.markers, self.parts[-len(self._specs)].vertices.start)
+        return graph
 
     def _record_skin(self, graph: LaunchGraph, index: int, first: int) -> None:
         """Append the skin of an avatar."""
