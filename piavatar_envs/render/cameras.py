@@ -178,6 +178,7 @@ class BatchCamera:
         *,
         follows: bool = True,
         agent: int = 0,
+        field_of_view: float | None = None,
         out: tuple[wp.array, wp.array] | None = None,
     ) -> None:
         """Place nothing yet.
@@ -190,6 +191,7 @@ class BatchCamera:
             envs: environment of each picture, ``(pictures,)`` int32.
             follows: whether a camera that is not on a body follows the avatars, or stands about the origin.
             agent: index of the avatar whose body it is on.
+            field_of_view: vertical angle of a camera that is on a body [deg].
             out: views and centers to write; new arrays if not given.
 
         Raises:
@@ -209,7 +211,7 @@ class BatchCamera:
         else:
             forward, up, offset = np.array(self._mount.forward), np.array(self._mount.up), self._mount.offset
             right = np.cross(forward, up)
-            focal = 0.5 * height / math.tan(math.radians(0.5 * BODY_FIELD_OF_VIEW))
+            focal = 0.5 * height / math.tan(math.radians(0.5 * (field_of_view or BODY_FIELD_OF_VIEW)))
         vectors = {"offset": offset, "right": right, "up": up, "forward": forward}
         self._placement = fill(
             Placement(),

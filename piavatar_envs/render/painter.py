@@ -43,6 +43,7 @@ class Painter:
         vertices: positions [m], shape ``(N, V)``; input. A vertex that is not finite hides its triangles.
         views: cameras, shape ``(N,)``; input.
         centers: points of the ground about which it fades [m], shape ``(N,)``; input.
+        drawn: pictures that change; the others stay as they were last drawn, shape ``(N,)`` bool; input, all at first.
         picture: sRGB bytes, shape ``(N, height, width, 3)``.
         depth: along the camera's axis, of the nearest surface in each pixel or of the ground, infinite in the sky [m],
             shape ``(N, height, width)``; None unless asked for.
@@ -99,6 +100,7 @@ class Painter:
         self.vertices = self._given(vertices, "vertices", (num_pictures, most), wp.vec3)
         self.views = self._given(views, "views", (num_pictures,), View)
         self.centers = wp.zeros(num_pictures, dtype=wp.vec2, device=device)
+        self.drawn = wp.full(num_pictures, True, dtype=wp.bool, device=device)
         self.color = wp.zeros(shape, dtype=wp.vec3, device=device)
         self.nearest = wp.zeros(shape, dtype=float, device=device)
         self.picture = wp.zeros((*shape, 3), dtype=wp.uint8, device=device)
@@ -124,23 +126,24 @@ class Painter:
         graph.launch(
             to_bytes,
             (self.num_pictures, k),
-            [k, _flat(self.color), _flat(self.nearest)],
+            [self.drawn, k, _flat(self.color), _flat(self.nearest)],
             [_flat(self.picture), _flat(self._depth)],
         )
 
     def _record_chunk(self, graph: LaunchGraph, first: int, count: int) -> None:
         shadows, lighting, raster, surfaces = self._shadows, self._lighting, self._raster, self.surfaces
-        vertices, views = self.vertices, self.views
-        shadows.record(graph, first, count, vertices, self._threads)
-        lighting.record(graph, first, count, vertices, views, shadows, self._threads)
-        raster.record(graph, first, count, vertices, views, shadows.areas, self._threads)
+        vertices, views, drawn = self.vertices, self.views, self.drawn[first : first + count]
+        shadows.record(graph, drawn, first, vertices, self._threads)
+        lighting.record(graph, drawn, first, vertices, views, shadows, self._threads)
+        raster.record(graph, drawn, first, vertices, views, shadows.areas, self._threads)
         k = self._threads(self.height * self.width)
         graph.launch(
             resolve,
             (count, k),
             [
-                first, k, self._samples, self._ground, self._paint, views, self.centers, surfaces.triangles, vertices,
-                lighting.light, lighting.lit, shadows.grids, shadows.opacity, raster.nearest, raster.num_large,
+                drawn, first, k, self._samples, self._ground, self._paint, views, self.centers, surfaces.triangles,
+                vertices, lighting.light, lighting.lit, shadows.grids, shadows.opacity, raster.nearest,
+                raster.num_large,
             ],
             [_flat(self.color), _flat(self.nearest), _flat(self._labels)],
         )  # fmt: skip

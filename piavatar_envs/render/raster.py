@@ -170,6 +170,7 @@ def draw(
 @wp.kernel
 def draw_triangles(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     first: int,
     threads: int,
     samples: int,
@@ -187,6 +188,8 @@ def draw_triangles(
 ):
     """Draw the triangles' fronts; those of more than ``large`` samples are left for :func:`draw_large`."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     n = first + c
     view = views[n]
     for t in range(thread, triangles.shape[0], threads):
@@ -214,6 +217,7 @@ def draw_triangles(
 @wp.kernel
 def draw_large(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     first: int,
     threads: int,
     samples: int,
@@ -227,6 +231,8 @@ def draw_large(
 ):
     """Draw large triangles, all threads of a picture one after the other."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     n = first + c
     view = views[n]
     for k in range(wp.min(num_large[c], large_triangles.shape[1])):
@@ -264,27 +270,27 @@ class Raster:
         self._large = wp.zeros((pictures, _MOST_LARGE if self._shares else 1), dtype=int, device=device)
 
     def record(
-        self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, views: wp.array, areas: wp.array,
+        self, graph: LaunchGraph, drawn: wp.array, first: int, vertices: wp.array, views: wp.array, areas: wp.array,
         threads: Threads,
     ) -> None:  # fmt: skip
         """Append the launches that draw a chunk.
 
         Args:
             graph: to append to.
+            drawn: which pictures of the chunk change, shape ``(C,)``.
             first: picture of the chunk's first row.
-            count: pictures of the chunk.
             vertices: of all pictures [m], shape ``(N, V)``.
             views: of all pictures, shape ``(N,)``.
             areas: outward normals times area of the chunk's triangles, zero where hidden, shape ``(C, T)``.
             threads: returns the number of threads a picture.
         """
         triangles = self._surfaces.triangles
-        k = threads(len(triangles))
+        count, k = len(drawn), threads(len(triangles))
         large = _LARGE if self._shares else (1 << 31) - 1
         graph.launch(
             draw_triangles,
             (count, k),
-            [first, k, self._samples, large, views, triangles, self._surfaces.subject, vertices, areas],
+            [drawn, first, k, self._samples, large, views, triangles, self._surfaces.subject, vertices, areas],
             [self.nearest, self.num_large, self._large],
         )
         if self._shares:
@@ -292,6 +298,6 @@ class Raster:
             graph.launch(
                 draw_large,
                 (count, k),
-                [first, k, self._samples, views, triangles, vertices, self.num_large, self._large],
+                [drawn, first, k, self._samples, views, triangles, vertices, self.num_large, self._large],
                 [self.nearest],
             )

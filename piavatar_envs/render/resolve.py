@@ -127,6 +127,7 @@ def inverse_depth_of(key: wp.uint64) -> float:
 @wp.kernel
 def resolve(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     first: int,
     threads: int,
     samples: int,
@@ -150,6 +151,8 @@ def resolve(
 ):
     """Average the samples of a pixel; where nothing was drawn, show the ground or the background."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     n = first + c
     view = views[n]
     own = grids[c]
@@ -235,6 +238,7 @@ def resolve(
 @wp.kernel
 def to_bytes(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (N,)
     threads: int,
     color: wp.array2d[wp.vec3],  # sRGB in [0, 1], (N, H * W)
     nearest: wp.array2d[float],  # [1/m]
@@ -244,6 +248,8 @@ def to_bytes(
 ):
     """Round the colours to bytes, and turn inverse depths into depths."""
     n, thread = wp.tid()
+    if not drawn[n]:
+        return
     for pixel in range(thread, color.shape[1], threads):
         seen = color[n, pixel]
         for channel in range(3):

@@ -97,6 +97,7 @@ def occlusion(own: Grids, filled: wp.array2d[int], c: int, at: wp.vec3, normal: 
 @wp.kernel
 def find_light(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     first: int,
     num_vertices: int,
     threads: int,
@@ -113,6 +114,8 @@ def find_light(
 ):
     """Find the normals of the vertices, and the light that reaches them."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     own = grids[c]
     for i in range(thread, num_vertices, threads):
         total = wp.vec3()
@@ -149,6 +152,7 @@ def smoothed(offsets: wp.array[int], neighbours: wp.array[int], shares: wp.array
 @wp.kernel
 def smooth_light(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     num_vertices: int,
     threads: int,
     offsets: wp.array[int],  # of the neighbours of every vertex, (V + 1,)
@@ -159,6 +163,8 @@ def smooth_light(
 ):
     """Average the light with that of the neighbours."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     for i in range(thread, num_vertices, threads):
         shares_out[c, i] = smoothed(offsets, neighbours, shares, c, i)
 
@@ -166,6 +172,7 @@ def smooth_light(
 @wp.kernel
 def send_light(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     first: int,
     num_vertices: int,
     threads: int,
@@ -182,6 +189,8 @@ def send_light(
 ):
     """Find the light that leaves the vertices towards the eye: a factor of their albedo, gloss, and their colour."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     eye = views[first + c].eye
     row = wp.min(first + c, albedo.shape[0] - 1)
     for i in range(thread, num_vertices, threads):
@@ -239,39 +248,39 @@ class Lighting:
         self.lit = wp.zeros(shape, dtype=wp.vec3, device=device)
 
     def record(
-        self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, views: wp.array, shadows: Shadows,
+        self, graph: LaunchGraph, drawn: wp.array, first: int, vertices: wp.array, views: wp.array, shadows: Shadows,
         threads: Threads,
     ) -> None:  # fmt: skip
         """Append the launches that light a chunk.
 
         Args:
             graph: to append to.
+            drawn: which pictures of the chunk change, shape ``(C,)``.
             first: picture of the chunk's first row.
-            count: pictures of the chunk.
             vertices: of all pictures [m], shape ``(N, V)``.
             views: of all pictures, shape ``(N,)``.
             shadows: of the chunk, recorded before.
             threads: returns the number of threads a picture.
         """
         surfaces = self._surfaces
-        k = threads(surfaces.num_vertices)
+        count, k = len(drawn), threads(surfaces.num_vertices)
         near, other = self._shares
         graph.launch(
             find_light,
             (count, k),
             [
-                first, surfaces.num_vertices, k, surfaces.incident_offsets, surfaces.incident, vertices, shadows.areas,
-                shadows.grids, shadows.depth, shadows.filled,
+                drawn, first, surfaces.num_vertices, k, surfaces.incident_offsets, surfaces.incident, vertices,
+                shadows.areas, shadows.grids, shadows.depth, shadows.filled,
             ],
             [self._normals, near],
         )  # fmt: skip
         around = [surfaces.neighbour_offsets, surfaces.neighbours]
         for _ in range(_SMOOTHINGS - 1):
-            graph.launch(smooth_light, (count, k), [surfaces.num_vertices, k, *around, near], [other])
+            graph.launch(smooth_light, (count, k), [drawn, surfaces.num_vertices, k, *around, near], [other])
             near, other = other, near
         graph.launch(
             send_light,
             (count, k),
-            [first, surfaces.num_vertices, k, *around, views, vertices, self._normals, near, surfaces.albedo],
+            [drawn, first, surfaces.num_vertices, k, *around, views, vertices, self._normals, near, surfaces.albedo],
             [self.light, self.lit],
         )

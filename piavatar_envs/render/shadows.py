@@ -109,6 +109,7 @@ def is_near(point: wp.vec3) -> bool:
 @wp.kernel
 def find_extents(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     first: int,
     num_vertices: int,
     threads: int,
@@ -119,6 +120,8 @@ def find_extents(
 ):
     """Find the least and greatest coordinates of the vertices."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     least = vec7(float(wp.inf))
     greatest = vec7(-float(wp.inf))
     for i in range(thread, num_vertices, threads):
@@ -143,6 +146,8 @@ def find_extents(
 
 @wp.kernel
 def place_grids(
+    # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     # in, out: cleared for the next run
     low: wp.array2d[float],  # (C, 7)
     high: wp.array2d[float],
@@ -151,6 +156,8 @@ def place_grids(
 ):
     """Place the grids around the surfaces, on multiples of their cells, so that shadows do not shimmer."""
     c = wp.tid()
+    if not drawn[c]:
+        return
     least = vec7()
     greatest = vec7()
     for k in range(_EXTENTS):
@@ -208,6 +215,7 @@ def place_grids(
 @wp.kernel
 def clear_grids(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     threads: int,
     grids: wp.array[Grids],
     # out
@@ -217,6 +225,8 @@ def clear_grids(
 ):
     """Empty the grids."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     own = grids[c]
     for i in range(thread, own.map_rows * own.map_columns, threads):
         depth[c, i] = NO_DEPTH
@@ -298,6 +308,7 @@ def cast_piece(
 @wp.kernel
 def cast_triangles(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     first: int,
     threads: int,
     triangles: wp.array[wp.vec3i],
@@ -311,6 +322,8 @@ def cast_triangles(
 ):
     """Find the area vectors of the triangles, and cast their shadows."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     n = first + c
     own = grids[c]
     for t in range(thread, triangles.shape[0], threads):
@@ -362,6 +375,7 @@ def shift_of(layer: int) -> int:
 @wp.kernel
 def blur_first(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     threads: int,
     grids: wp.array[Grids],
     depth: wp.array2d[int],
@@ -374,6 +388,8 @@ def blur_first(
 ):
     """Widen the map by a texel; blur the voxels along x and the patch's layers along columns."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     own = grids[c]
     for i in range(thread, own.map_rows * own.map_columns, threads):
         row = i // own.map_columns
@@ -396,6 +412,7 @@ def blur_first(
 @wp.kernel
 def blur_second(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     threads: int,
     grids: wp.array[Grids],
     area: wp.array2d[int],
@@ -406,6 +423,8 @@ def blur_second(
 ):
     """Blur the voxels along y and the patch's layers along rows; no texel is covered more than once."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     own = grids[c]
     for i in range(thread, own.voxels_x * own.voxels_y * own.voxels_z, threads):
         area_out[c, i] = blurred(area, c, i, own.voxels_z, (i // own.voxels_z) % own.voxels_y, own.voxels_y)
@@ -442,6 +461,7 @@ def layer_at(own: Grids, cover: wp.array2d[int], c: int, layer: int, i: int, j: 
 @wp.kernel
 def blur_third(
     # in
+    drawn: wp.array[wp.bool],  # pictures that change, (C,)
     threads: int,
     grids: wp.array[Grids],
     area: wp.array2d[int],
@@ -452,6 +472,8 @@ def blur_third(
 ):
     """Blur the voxels along z, and join the layers of the patch to the shadow's opacity."""
     c, thread = wp.tid()
+    if not drawn[c]:
+        return
     own = grids[c]
     for i in range(thread, own.voxels_x * own.voxels_y * own.voxels_z, threads):
         area_out[c, i] = blurred(area, c, i, 1, i % own.voxels_z, own.voxels_z)
@@ -520,13 +542,13 @@ class Shadows:
         self.depth, self.filled = self._depths[1], self._areas[1]
         self.opacity = wp.zeros((pictures, PATCH_LIMIT**2), dtype=float, device=device)
 
-    def record(self, graph: LaunchGraph, first: int, count: int, vertices: wp.array, threads: Threads) -> None:
+    def record(self, graph: LaunchGraph, drawn: wp.array, first: int, vertices: wp.array, threads: Threads) -> None:
         """Append the launches that find the shadows of a chunk.
 
         Args:
             graph: to append to.
+            drawn: which pictures of the chunk change, shape ``(C,)``.
             first: picture of the chunk's first row.
-            count: pictures of the chunk.
             vertices: of all pictures [m], shape ``(N, V)``.
             threads: returns the number of threads a picture.
         """
@@ -534,18 +556,22 @@ class Shadows:
             self._surfaces, self._depths, self._areas, self._covers,
         )  # fmt: skip
         # Few threads, because all of them meet at the same extents.
-        k = min(threads(surfaces.num_vertices), _EXTENT_THREADS)
-        graph.launch(find_extents, (count, k), [first, surfaces.num_vertices, k, vertices], [self._low, self._high])
-        graph.launch(place_grids, count, [self._low, self._high], [self.grids])
+        count, k = len(drawn), min(threads(surfaces.num_vertices), _EXTENT_THREADS)
+        graph.launch(
+            find_extents, (count, k), [drawn, first, surfaces.num_vertices, k, vertices], [self._low, self._high]
+        )
+        graph.launch(place_grids, count, [drawn, self._low, self._high], [self.grids])
         cells = threads(LAYER_TEXELS)
-        graph.launch(clear_grids, (count, cells), [cells, self.grids], [depth, area, cover])
+        graph.launch(clear_grids, (count, cells), [drawn, cells, self.grids], [depth, area, cover])
         k = threads(len(surfaces.triangles))
         graph.launch(
             cast_triangles,
             (count, k),
-            [first, k, surfaces.triangles, vertices, self.grids],
+            [drawn, first, k, surfaces.triangles, vertices, self.grids],
             [self.areas, depth, area, cover],
         )
-        graph.launch(blur_first, (count, cells), [cells, self.grids, depth, area, cover], [widened, area_2, cover_2])
-        graph.launch(blur_second, (count, cells), [cells, self.grids, area_2, cover_2], [area, cover])
-        graph.launch(blur_third, (count, cells), [cells, self.grids, area, cover], [area_2, self.opacity])
+        graph.launch(
+            blur_first, (count, cells), [drawn, cells, self.grids, depth, area, cover], [widened, area_2, cover_2]
+        )
+        graph.launch(blur_second, (count, cells), [drawn, cells, self.grids, area_2, cover_2], [area, cover])
+        graph.launch(blur_third, (count, cells), [drawn, cells, self.grids, area, cover], [area_2, self.opacity])

@@ -321,3 +321,19 @@ def test_bad_requests_are_refused(device):
         MeshPart(4, quad()[1], texture=np.zeros((4, 4, 3), np.uint8))
     with pytest.raises(ValueError, match="subject=300"):
         MeshPart(4, quad()[1], subject=300)
+
+
+def test_pictures_that_are_not_chosen_stay(device):
+    balls = [Sphere(np.array([0.0, 0.0, 1.0]), 0.5)]
+    painter = paint(device, balls, [AHEAD, AHEAD], size=24, depth=True, segmentation=True)
+    before = [array.numpy().copy() for array in (painter.picture, painter.depth, painter.labels)]
+    moved = painter.vertices.numpy() + np.array([0.3, 0.0, 0.2], np.float32)
+    painter.vertices.assign(moved)
+    painter.drawn.assign(np.array([False, True]))
+    painter.graph.run()
+    alone = paint(device, balls, [AHEAD], size=24, vertices=moved[:1], depth=True, segmentation=True)
+    now = [array.numpy() for array in (painter.picture, painter.depth, painter.labels)]
+    then = [array.numpy() for array in (alone.picture, alone.depth, alone.labels)]
+    for old, new, expected in zip(before, now, then, strict=True):
+        assert np.array_equal(new[0], old[0]) and np.array_equal(new[1], expected[0])
+        assert not np.array_equal(new[1], old[1])
