@@ -160,7 +160,7 @@ class Subject:
             place = f"observation {component(self.many, index[3])}"
         elif names:  # an array without names has one column without meaning
             place = f"{name} {names[index[3]]!r}"
-        when = "before the first step" if name == "start" else f"in step {index[0] + 1}"
+        when = "before the first step" if name.startswith(("start", "first ")) else f"in step {index[0] + 1}"
         agent = f" of {task.agent_names[index[2]]}" if len(index) > 2 and self.many.num_agents > 1 else ""
         return f"{when} {place}{agent} in environment {index[1] if env is None else env}"
 
@@ -182,7 +182,11 @@ def play(host: EpisodeHost, actions: np.ndarray, seed: int) -> Run:
     """Reset to ``seed`` and step under ``actions``, with the next episode wherever one ends."""
     host.reset(seed)
     start = host.observation()[None]
-    return {"start": start, **go_on(host, actions)}
+    return {
+        "start": start,
+        **{f"first {name}": values[None] for name, values in pictures(host).items()},
+        **go_on(host, actions),
+    }
 
 
 def go_on(host: EpisodeHost, actions: np.ndarray) -> Run:
@@ -190,10 +194,16 @@ def go_on(host: EpisodeHost, actions: np.ndarray) -> Run:
     rows = []
     for action in actions:
         host.step(action)
-        rows.append({name: host.read(array_of(name)) for name in COMPARED})
+        rows.append({name: host.read(array_of(name)) for name in COMPARED} | pictures(host))
         if host.find_ended().any():
             host.reset_ended()
-    return {name: np.stack([row[name] for row in rows]) for name in COMPARED}
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def pictures(host: EpisodeHost) -> State:
+    """Return the pictures that agents observe, ``(num_envs, num_agents, height, width, channels)`` by name."""
+    seen = [host.observed_pictures(agent) for agent in range(host.num_agents)]
+    return {name: np.stack([own[name] for own in seen], axis=1) for name in seen[0]}
 
 
 def array_of(name: str) -> Callable[[BatchEnv], Any]:
@@ -238,7 +248,14 @@ def check_observations(subject: Subject) -> Iterator[str]:
     seen = np.concatenate([run["start"], run["observation"]])
     space = many.observation_space()
     rows = seen.reshape(-1, seen.shape[-1])
-    outside = sum(not space.contains(many.named(row)) for row in rows)
+    drawn = {
+        name: np.concatenate([run[f"first {name}"], run[name]]).reshape(-1, *run[name].shape[3:])
+        for name in pictures(many)
+    }
+    outside = sum(
+        not space.contains(many.named(row, {name: values[index] for name, values in drawn.items()}))
+        for index, row in enumerate(rows)
+    )
     if outside:
         yield f"{outside} of {len(rows)} observations are not in the observation space {space}"
     for term in many.task.terms():
@@ -285,8 +302,15 @@ def check_memory(subject: Subject) -> Iterator[str]:
     for action in subject.actions[:2]:
         many.step(action)
         given += [(name, many.read(array_of(name))) for name in COMPARED]
+        given += many.observed_pictures(0).items()
     own = [(name, array.numpy()) for group in many.groups for name, array in group.arrays().items()]
     own += [(name, array_of(name)(group).numpy()) for group in many.groups for name in COMPARED]
+    own += [
+        (name, arrays[0].numpy())
+        for group in many.groups
+        if group.pixels
+        for name, arrays in group.pixels.arrays.items()
+    ]
     for place, (name, value) in enumerate(given):
         for other, array in [*given[:place], *own]:
             if np.shares_memory(value, array):
@@ -349,11 +373,11 @@ def check_observing(subject: Subject) -> Iterator[str]:
     """Check that observing changes nothing."""
     many = subject.many
     play(many, subject.actions[:2], subject.seed)
-    before, seen = many.get_state(), many.observation()
+    before, seen = many.get_state(), {"observation": many.observation(), **pictures(many)}
     for group in many.groups:
         group.observe_graph.run()
     changed = changed_arrays(before, many.get_state())
-    if changed or many.observation().tobytes() != seen.tobytes():
+    if changed or changed_arrays(seen, {"observation": many.observation(), **pictures(many)}):
         what = ", ".join(changed) or "the observation"
         yield f"observing a second time changes {what}; record_observe must write into env.observation alone"
 

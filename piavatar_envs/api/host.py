@@ -20,7 +20,7 @@ from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.pictures import Live, Pictures, check_extra
 from piavatar_envs.api.readings import find_reading
 from piavatar_envs.avatar.torque_control.controller import checked_assist
-from piavatar_envs.config import ConfigError, EnvConfig
+from piavatar_envs.config import ConfigError, EnvConfig, PixelsConfig
 from piavatar_envs.config import replace as replace_settings
 from piavatar_envs.config.load import plain
 from piavatar_envs.core.capture_lock import CAPTURE
@@ -114,6 +114,7 @@ class EpisodeHost:
         self._splits = np.cumsum(sizes)[:-1]
         self._pool = ThreadPoolExecutor(threads - 1, "piavatar") if threads > 1 else None
         self._captured: set[Callable[[BatchEnv], Any]] = set()
+        self._seen = tuple(self.groups[0].pixels.arrays) if self.groups[0].pixels else ()
         self.task, self.config, self.num_envs, self.device = task, task.config, num_envs, device
         first = self.groups[0]
         self.num_agents, self.layout, self.action_size = first.num_agents, first.layout, first.action_spec.size
@@ -149,10 +150,20 @@ class EpisodeHost:
         return gym.spaces.Box(-1.0, 1.0, (self.action_size,), np.float32)
 
     def observation_space(self) -> gym.Space:
-        """Return a new, unbounded space of the observations of one agent: a Box, or a Dict with ``obs_mode="dict"``."""
-        if self.config.obs_mode == "dict":
+        """Return a new space of the observations of one agent, as ``obs_mode`` has it.
+
+        A Box, or a Dict: by term with ``"dict"``; with pictures of ``"pixels"`` and, where they are observed,
+        ``"depth"``, ``"segmentation"`` and ``"state"``.
+        """
+        mode, flat = self.config.obs_mode, _unbounded(self.layout.size)
+        if mode == "flat":
+            return flat
+        if mode == "dict":
             return gym.spaces.Dict({name: _unbounded(term.size) for name, term in self.layout.items()})
-        return _unbounded(self.layout.size)
+        spaces = picture_spaces(self.config.pixels)
+        if mode == "pixels":
+            return gym.spaces.Dict(spaces) if len(spaces) > 1 else spaces["pixels"]
+        return gym.spaces.Dict(spaces | {"state": flat})
 
     def state_space(self) -> gym.spaces.Box:
         """Return a new space of the flat observations of all agents of one environment, one after the other."""
@@ -287,12 +298,16 @@ class EpisodeHost:
         self.check_ready("step")
         acted = self.alive()
         self.step(actions)
-        terminated, final = self.terminated(), self.observation()
+        terminated, final, last_seen = self.terminated(), self.observation(), self._all_pictures()
         truncated = self.truncated()[:, None] & ~terminated
         infos = [self.status(agent) | self.outcome(agent) for agent in range(self.num_agents)]
         ended = self.find_ended()
         self.reset_ended()
-        return Transition(self.observation(), final, self.reward(), terminated, truncated, ended, acted, infos)
+        now = self.observation(), self._all_pictures()
+        return Transition(*now, final, last_seen, self.reward(), terminated, truncated, ended, acted, infos)
+
+    def _all_pictures(self) -> list[dict[str, Array]]:
+        return [self.observed_pictures(agent) for agent in range(self.num_agents)]
 
     def _run(self, graph: Callable[[BatchEnv], Any]) -> None:
         """Run a method of every group, each in its own thread."""
@@ -322,9 +337,25 @@ class EpisodeHost:
         """Return flat observations ``(num_envs, num_agents, observation_size)`` float32."""
         return self.read(lambda group: group.observation)
 
-    def named(self, observation: Array) -> dict[str, Array] | Array:
-        """Split ``observation``, flat along its last axis, by name with ``obs_mode="dict"``; else keep it."""
-        return self.api.split(observation, self.layout) if self.config.obs_mode == "dict" else observation
+    def observed_pictures(self, agent: int) -> dict[str, Array]:
+        """Return the pictures that an agent observes, ``(num_envs, height, width, channels)`` by name; or none."""
+        return {name: self.read(lambda group, name=name: group.pixels.arrays[name][agent]) for name in self._seen}
+
+    def named(self, observation: Array, pictures: Mapping[str, Array] | None = None) -> dict[str, Array] | Array:
+        """Return an observation in the form that ``obs_mode`` has.
+
+        Args:
+            observation: flat along its last axis.
+            pictures: that belong to it, by name.
+        """
+        mode = self.config.obs_mode
+        if mode == "dict":
+            return self.api.split(observation, self.layout)
+        if mode == "flat":
+            return observation
+        if mode == "pixels":
+            return dict(pictures) if len(pictures) > 1 else pictures["pixels"]
+        return {**pictures, "state": observation}
 
     def reward(self) -> Array:
         """Return the reward of the last step, ``(num_envs, num_agents)`` float32."""
@@ -517,7 +548,8 @@ class EpisodeHost:
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every environment, ``(height, width, 3)`` uint8, with ``render_mode="rgb_array"``; else return None.
 
-        With ``"human"`` resets and steps update the live view.
+        With ``render.mosaic`` every entry is the same picture, of several environments side by side. With ``"human"``
+        resets and steps update the live view.
 
         Raises:
             ImportError: pictures have text, and Pillow is not installed (extra ``render``).
@@ -527,7 +559,11 @@ class EpisodeHost:
             gym.logger.warn('render() needs an environment made with render_mode="rgb_array"')
             return None
         self.check_ready("render")
-        return None if self.live else tuple(self.pictures.frame(env) for env in range(self.num_envs))
+        if self.live:
+            return None
+        if self.config.render.mosaic:
+            return (self.pictures.mosaic(min(self.config.render.mosaic, self.num_envs)),) * self.num_envs
+        return tuple(self.pictures.frame(env) for env in range(self.num_envs))
 
     def close(self) -> None:
         """Free the renderers, stop the live view and end the threads; closing twice is fine.
@@ -549,7 +585,8 @@ class Transition:
 
     Attributes:
         observation: from which the next step begins, ``(num_envs, num_agents, observation_size)``.
-        final_observation: to which this step led; where nothing ended it is the same.
+        pictures: that belong to it, by agent and name; see :meth:`EpisodeHost.observed_pictures`.
+        final_observation, final_pictures: to which this step led; where nothing ended they are the same.
         reward: ``(num_envs, num_agents)``; zero for an agent that was out before.
         terminated: ``(num_envs, num_agents)`` bool; stays True while the others go on.
         truncated: ``(num_envs, num_agents)`` bool, the clock has run out for an agent that was still in.
@@ -559,7 +596,9 @@ class Transition:
     """
 
     observation: Array
+    pictures: Sequence[dict[str, Array]]
     final_observation: Array
+    final_pictures: Sequence[dict[str, Array]]
     reward: Array
     terminated: Array
     truncated: Array
@@ -742,8 +781,9 @@ class SingleView(HostView):
         return self.host.reading(name, agent)[0]
 
     def _observation(self, agent: int) -> Any:
-        """Copy the observation of an agent: a flat vector, or a dictionary with ``obs_mode="dict"``."""
-        return self.host.named(self.host.observation()[0, agent])
+        """Copy the observation of an agent, in the form that ``obs_mode`` has."""
+        pictures = {name: values[0] for name, values in self.host.observed_pictures(agent).items()}
+        return self.host.named(self.host.observation()[0, agent], pictures)
 
     def _info(self, agent: int, stepped: bool = False) -> dict[str, Any]:
         """Return the info of an agent as numbers and vectors; the outcome of a step is zero at a reset.
@@ -820,6 +860,20 @@ def checked_seed(seed: Any) -> int:
 def _unbounded(size: int) -> gym.spaces.Box:
     """Return the space of all vectors of ``size`` float32."""
     return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+
+def picture_spaces(settings: PixelsConfig) -> dict[str, gym.spaces.Box]:
+    """Return the spaces of the observed pictures, by name."""
+
+    def box(channels: int, highest: float, kind: type) -> gym.spaces.Box:
+        return gym.spaces.Box(0, highest, (settings.height, settings.width, channels), kind)
+
+    spaces = {"pixels": box(3, 255, np.uint8)}
+    if settings.depth:
+        spaces["depth"] = box(1, settings.farthest, np.float32)
+    if settings.segmentation:
+        spaces["segmentation"] = box(1, 255, np.uint8)  # the whole range of bytes, by which learners tell an image
+    return spaces
 
 
 def _single(value: np.ndarray | np.generic) -> Any:

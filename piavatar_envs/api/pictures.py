@@ -5,6 +5,7 @@ The renderer is imported when the first picture is drawn, so that environments w
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,12 +21,13 @@ from piavatar_envs.config import BodyColor, RenderConfig
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.pixels import task_camera
 from piavatar_envs.sim.forces import Target
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-    from piavatar_envs.render import Arrow, Camera, Marker, MovedSplats, Scene
+    from piavatar_envs.render import Arrow, Marker, MovedSplats, Scene
     from piavatar_envs.render.live import Drag, LiveView
     from piavatar_envs.render.stage import Stage
     from piavatar_envs.sim.markers import MarkerSpec
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
 #: Render modes of one environment, and of a batch: a live view shows one.
 RENDER_MODES = ("rgb_array", "human")
 BATCH_RENDER_MODES = ("rgb_array",)
-#: Height of the bodies that tasks place their cameras for, at most [m].
-SHOWN_HEIGHT = 1.8
 #: Least time between two scenes sent to a browser [s]: no screen shows more.
 _LEAST_INTERVAL = 1.0 / 60.0
 
@@ -173,18 +173,6 @@ class Progress:
         return (now[3] - before[3]) * batch.config.physics.control_dt
 
 
-def camera_of(batch: BatchEnv) -> Camera:
-    """Return the task's camera, farther from bodies taller than :data:`SHOWN_HEIGHT` unless settings place it."""
-    from piavatar_envs.render import Camera
-
-    task, render = batch.task, batch.config.render
-    size = max(1.0, max(flesh.height for flesh in batch.simulation.flesh) / SHOWN_HEIGHT)
-    if render.camera_position is not None or render.camera_target is not None:
-        size = 1.0
-    position, target = (tuple(size * value for value in place) for place in (task.camera_position, task.camera_target))
-    return Camera(position, target)
-
-
 class Picture:
     """Draws environments of a batch with one renderer."""
 
@@ -193,7 +181,8 @@ class Picture:
         from piavatar_envs.render import Renderer
 
         self.config = config
-        self.renderer = Renderer(config.width, config.height, camera_of(batch), scale=config.overlays)
+        camera = task_camera(batch, batch.task)
+        self.renderer = Renderer(config.width, config.height, camera, scale=config.overlays)
         self._scenes = SceneReader(batch)
 
     def cut(self) -> None:
@@ -237,6 +226,21 @@ class Pictures:
         if elapsed is None:
             self._opened[env].cut()
         return self._opened[env].frame(own, elapsed or 0.0)
+
+    def mosaic(self, count: int) -> np.ndarray:
+        """Draw the first ``count`` environments side by side, in rows as near to a square as can be; the rest is black.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+        """
+        frames = np.stack([self.frame(env) for env in range(count)])
+        columns = math.ceil(math.sqrt(count))
+        rows = math.ceil(count / columns)
+        height, width = frames.shape[1:3]
+        tiles = np.zeros((rows * columns, *frames.shape[1:]), np.uint8)
+        tiles[:count] = frames
+        grid = tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2)
+        return grid.reshape(rows * height, columns * width, 3)
 
     def close(self) -> None:
         """Close all renderers."""
@@ -447,7 +451,7 @@ class Live:
         if self._view is None:
             from piavatar_envs.render.live import LiveView
 
-            self._view = LiveView(camera_of(self._batch), self._port)
+            self._view = LiveView(task_camera(self._batch, self._batch.task), self._port)
         return self._view
 
     def begin(self) -> None:

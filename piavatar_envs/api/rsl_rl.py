@@ -40,7 +40,7 @@ class AvatarRslEnv(HostView, VecEnv):
         device: torch's, of all tensors.
         cfg: the settings as plain values, for rsl_rl's loggers.
         config: the settings.
-        groups: names of the terms in every observation group.
+        groups: names of the terms in every observation group; those of pictures are not among them.
         host: holds the environments.
     """
 
@@ -64,7 +64,9 @@ class AvatarRslEnv(HostView, VecEnv):
             config: settings as a mapping, a YAML file or a configuration.
             groups: terms of the observation by observation group, such as ``{"policy": ["target_position"]}``, to be
                 named in the runner's ``obs_groups``. By default all of it is ``policy``; with ``obs_mode="dict"`` every
-                term is a group of its own.
+                term is a group of its own; with ``"pixels"`` there is none, and groups given here are for a critic that
+                sees more than the actor. Pictures are always groups of their own, ``pixels``, ``depth`` and
+                ``segmentation``.
             seed: environment ``i`` plays the episodes of ``seed + i``; without one they differ every time.
             num_threads: threads on a CPU; as many as there are cores if not given.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
@@ -94,9 +96,12 @@ class AvatarRslEnv(HostView, VecEnv):
     def _checked_groups(self, groups: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
         layout = self.host.layout
         if groups is None:
-            by_term = self.config.obs_mode == "dict"
-            return {name: (name,) for name in layout} if by_term else {"policy": tuple(layout)}
+            by_term = {name: (name,) for name in layout}
+            return {"dict": by_term, "pixels": {}}.get(self.config.obs_mode, {"policy": tuple(layout)})
+        taken = self.host.observed_pictures(0)
         for group, names in groups.items():
+            if group in taken:
+                raise ConfigError(f"groups: {group!r} is that of the pictures; choose another name")
             unknown = [name for name in names if name not in layout]
             if unknown or not names:
                 what = f"has no term {unknown[0]!r}" if unknown else "is empty"
@@ -147,8 +152,8 @@ class AvatarRslEnv(HostView, VecEnv):
         return self.get_observations(), {}
 
     def get_observations(self) -> TensorDict:
-        """Return the observations by group, each ``(num_envs, size)``."""
-        return self.grouped(self.host.observation())
+        """Return the observations by group, each ``(num_envs, size)``; for pictures see :func:`picture_groups`."""
+        return self.grouped(self.host.observation(), self.host.observed_pictures(0))
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advance by one control step.
@@ -169,20 +174,40 @@ class AvatarRslEnv(HostView, VecEnv):
         extras = {
             "time_outs": done.truncated[:, 0],
             "log": done.means(self.host.task.metric_names),
-            "final_observations": self.grouped(done.final_observation),
+            "final_observations": self.grouped(done.final_observation, done.final_pictures[0]),
             "info": done.infos[0],
         }
-        return self.grouped(done.observation), done.reward[:, 0], done.ended.long(), extras
+        now = self.grouped(done.observation, done.pictures[0])
+        return now, done.reward[:, 0], done.ended.long(), extras
 
-    def grouped(self, observation: torch.Tensor) -> TensorDict:
-        """Split flat observations ``(n, 1, observation_size)`` into the groups that the runner's networks take."""
+    def grouped(self, observation: torch.Tensor, pictures: Mapping[str, torch.Tensor]) -> TensorDict:
+        """Return the groups that the runner's networks take.
+
+        Args:
+            observation: flat, ``(n, 1, observation_size)``.
+            pictures: by name, see :func:`picture_groups`.
+        """
         layout = self.host.layout
         groups = {
             group: torch.cat([observation[:, 0, layout[name].slice] for name in names], dim=-1)
             for group, names in self.groups.items()
         }
+        groups |= picture_groups(pictures)
         return TensorDict(groups, batch_size=[len(observation)], device=self.device)
 
     def close(self) -> None:
         """End the threads."""
         self.host.close()
+
+
+def picture_groups(pictures: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return pictures as networks take them: float32, channels first, colours in [0, 1].
+
+    Args:
+        pictures: ``(n, height, width, channels)`` by name.
+    """
+    groups = {}
+    for name, picture in pictures.items():
+        values = picture.permute(0, 3, 1, 2).to(torch.float32, memory_format=torch.contiguous_format)
+        groups[name] = values / 255.0 if name == "pixels" else values
+    return groups

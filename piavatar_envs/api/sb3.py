@@ -145,8 +145,9 @@ class SB3VecEnv(VecEnv):
         self.vector.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Draw every environment; None without ``render_mode="rgb_array"``."""
-        return self.vector.render() or [None] * self.num_envs
+        """Draw every environment, or with ``render.mosaic`` one picture; None without ``render_mode="rgb_array"``."""
+        frames = self.vector.render() or [None] * self.num_envs
+        return frames[:1] if self.vector.config.render.mosaic else frames
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
         """Return an attribute of the vector, once for every environment: they share it.

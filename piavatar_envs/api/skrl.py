@@ -14,7 +14,7 @@ Several, for MAPPO and IPPO::
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -102,7 +102,7 @@ class AvatarSkrlEnv(HostView):
             ValueError: a seed outside [0, 2^32).
         """
         self.host.reset(seed)
-        return {"policy": self._named(self.host.observation())}, {}
+        return {"policy": self._named(self.host.observation(), self.host.observed_pictures(0))}, {}
 
     def step(self, actions: Array) -> tuple[dict[str, Any], Array, Array, Array, dict[str, Any]]:
         """Advance by one control step.
@@ -123,15 +123,15 @@ class AvatarSkrlEnv(HostView):
         done = self.host.step_and_reset(_joint([actions], self.num_envs, self.host.action_size))
         info = {
             **done.infos[0],
-            "final_obs": {"policy": self._named(done.final_observation)},
+            "final_obs": {"policy": self._named(done.final_observation, done.final_pictures[0])},
             "_final_obs": done.ended,
             "episode": done.means(self.host.task.metric_names),
         }
         outcome = done.reward[:, 0], done.terminated[:, 0], done.truncated[:, 0]
-        return {"policy": self._named(done.observation)}, *outcome, info
+        return {"policy": self._named(done.observation, done.pictures[0])}, *outcome, info
 
-    def _named(self, observation: Array) -> Any:
-        return self.host.named(observation[:, 0])
+    def _named(self, observation: Array, pictures: Mapping[str, Array]) -> Any:
+        return self.host.named(observation[:, 0], pictures)
 
     def close(self) -> None:
         """End the threads."""
@@ -230,7 +230,12 @@ class AvatarSkrlMultiEnv(HostView):
             ValueError: a seed outside [0, 2^32).
         """
         self.host.reset(seed)
-        return self._named(self.host.observation()), {"alive": self._by_agent(self.host.alive())}
+        return self._now()
+
+    def _now(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the present observations and the info of a reset."""
+        pictures = [self.host.observed_pictures(agent) for agent in range(self.num_agents)]
+        return self._named(self.host.observation(), pictures), {"alive": self._by_agent(self.host.alive())}
 
     def step(self, actions: Mapping[str, Array]) -> tuple[dict[str, Any], ...]:
         """Advance by one control step.
@@ -252,14 +257,14 @@ class AvatarSkrlMultiEnv(HostView):
         rows = [actions[name] for name in self.possible_agents]
         done = self.host.step_and_reset(_joint(rows, self.num_envs, self.host.action_size))
         flags = (self._by_agent(values) for values in (done.reward, done.terminated, done.truncated))
-        return self._named(done.observation), *flags, self._infos(done)
+        return self._named(done.observation, done.pictures), *flags, self._infos(done)
 
     def _infos(self, done: Transition) -> dict[str, Any]:
         return {
             **dict(zip(self.possible_agents, done.infos, strict=True)),
             "acted": self._by_agent(done.acted),
             "alive": self._by_agent(self.host.alive()),
-            "final_obs": self._named(done.final_observation),
+            "final_obs": self._named(done.final_observation, done.final_pictures),
             "final_state": done.final_observation.flatten(1),
             "_final_obs": done.ended,
             "episode": done.means(self.host.task.metric_names),
@@ -270,8 +275,9 @@ class AvatarSkrlMultiEnv(HostView):
         self.host.check_ready("state")
         return self.host.observation().flatten(1)
 
-    def _named(self, observation: Array) -> dict[str, Any]:
-        return {name: self.host.named(seen) for name, seen in self._by_agent(observation).items()}
+    def _named(self, observation: Array, pictures: Sequence[Mapping[str, Array]]) -> dict[str, Any]:
+        flat = self._by_agent(observation).items()
+        return {name: self.host.named(own, seen) for (name, own), seen in zip(flat, pictures, strict=True)}
 
     def _by_agent(self, values: Array) -> dict[str, Array]:
         """Split ``values`` ``(num_envs, num_agents, ...)`` by agent into separate copies."""

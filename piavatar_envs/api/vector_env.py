@@ -385,8 +385,8 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
             )
 
     def _observation(self) -> Any:
-        """Return the observations, by name with ``obs_mode="dict"``."""
-        return self.host.named(self.host.observation()[:, 0])
+        """Return the observations, in the form that ``obs_mode`` has."""
+        return self.host.named(self.host.observation()[:, 0], self.host.observed_pictures(0))
 
     def _ends(self) -> tuple[Array, Array, Array]:
         """Return rewards, terminations and truncations."""
@@ -420,6 +420,9 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every environment, ``(height, width, 3)`` uint8, with ``render_mode="rgb_array"``; else return None.
+
+        With ``render.mosaic`` every entry is the same picture, of several environments side by side: for Gymnasium's
+        ``RecordVideo`` with ``record_first_only=True``.
 
         Raises:
             ImportError: pictures have text, and Pillow is not installed (extra ``render``).

@@ -100,7 +100,7 @@ def load_config(
     chosen = _merge(base, above)
     base, above = _with_preset(cls, base, chosen), _with_preset(cls, above, chosen)
     merged = _merge(_without_replaced_variants(cls, base, above), above)
-    merged = _merge(_own_defaults(cls, merged), merged)
+    merged = _merge(_without_replaced_variants(cls, _own_defaults(cls, merged), merged), merged)
     try:
         # as JSON, files, keywords and command lines are validated alike: a list may be a tuple, a string is no number
         return cls.model_validate_json(json.dumps(plain(merged)))
@@ -306,13 +306,15 @@ def _expand_value(field: FieldInfo | None, value: Any, prefix: str) -> Any:
 
 
 def _qualified(cls: type[BaseModel], key: str) -> str:
-    """Return the dotted name of a bare key, if exactly one section has a setting of that name.
+    """Return the dotted name of a bare key, if exactly one section has a setting of that name, or the model says which.
 
     Raises:
         ConfigError: several sections have one.
     """
     if "." in key or key in cls.model_fields:
         return key
+    if chosen := getattr(cls, "bare_names", {}).get(key):
+        return chosen
     found = [name for name in setting_keys(cls) if name.rpartition(".")[2] == key]
     if len(found) > 1:
         raise ConfigError(f"{key} is ambiguous in {cls.__name__}; say which: {' or '.join(found)}")
@@ -351,10 +353,14 @@ def _with_preset(cls: type[BaseModel], layer: dict[str, Any], chosen: Mapping[st
 def _without_replaced_variants(
     cls: type[BaseModel], base: Mapping[str, Any], top: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """Drop from ``base`` the settings of a union's variant that ``top`` replaces by another one."""
+    """Drop from ``base`` the settings of a union's variant that ``top`` replaces by another one, in sections too."""
     kept = dict(base)
     for name, field in cls.model_fields.items():
-        if not variants_of(field) or not isinstance(base.get(name), Mapping) or not isinstance(top.get(name), Mapping):
+        if not isinstance(base.get(name), Mapping) or not isinstance(top.get(name), Mapping):
+            continue
+        if section := section_of(field.annotation):
+            kept[name] = _without_replaced_variants(section, base[name], top[name])
+        if not variants_of(field):
             continue
         before = _variant(field, base[name])
         after = _variant(field, {field.discriminator: base[name].get(field.discriminator, ...)} | top[name])

@@ -644,6 +644,13 @@ class RenderConfig(BaseModel):
         "bodies on the body part in the last control step (impulse)",
     )
     overlays: bool = Field(True, description="draw what is no matter: the task's markers, and the scale of colours")
+    mosaic: int | None = Field(
+        None,
+        ge=1,
+        le=1024,
+        description="number of environments, the first ones, that render() of a vector shows side by side in one "
+        "picture; null for a picture of each",
+    )
     camera_position: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="position of the camera, from the ground below what it follows; null as the task has it [m]"
     )
@@ -652,6 +659,60 @@ class RenderConfig(BaseModel):
     )
     camera_follows: bool | None = Field(
         None, description="follow the avatars, or stay at the origin; null as the task has it"
+    )
+
+
+class NamedCamera(BaseModel):
+    """A camera of the task, or one fixed to a bone of the agent that observes."""
+
+    model_config = FROZEN
+
+    kind: Literal["task", "head", "left_hand", "right_hand"] = Field(
+        "task",
+        description="task: the camera of render(), above what it follows; head, left_hand, right_hand: fixed to that "
+        "bone of the agent that observes",
+    )
+
+
+class PlacedCamera(BaseModel):
+    """A camera at a place of your own."""
+
+    model_config = FROZEN
+
+    kind: Literal["placed"] = Field("placed", description="placed: where position and target say")
+    position: Vector = Field(
+        (1.75, -3.75, 1.62), description="the eye, from the ground below what it follows, or from the origin [m]"
+    )
+    target: Vector = Field((0.0, -0.04, 0.86), description="the point that it looks at, from the same origin [m]")
+    follows: bool = Field(True, description="follow the avatars over the ground, or stay at the origin")
+
+    @model_validator(mode="after")
+    def _check_direction(self) -> PlacedCamera:
+        """Refuse a camera that looks at its own place."""
+        if math.dist(self.position, self.target) < 1.0e-3:
+            raise ConfigError(f"position={list(self.position)} is where it looks; move it or target")
+        return self
+
+
+class PixelsConfig(BaseModel):
+    """Pictures as observations; used only with ``obs_mode="pixels"`` and ``"pixels+state"``."""
+
+    model_config = FROZEN
+
+    width: int = Field(64, ge=8, le=1024, description="width of an observed picture [pixel]")
+    height: int = Field(64, ge=8, le=1024, description="height of an observed picture [pixel]")
+    camera: NamedCamera | PlacedCamera = Field(
+        default_factory=NamedCamera, discriminator="kind", description="what is seen"
+    )
+    field_of_view: float | None = Field(
+        None, ge=1.0, le=120.0, description="vertical angle; null for 90 of cameras on a body, and 29 of others [deg]"
+    )
+    depth: bool = Field(False, description="observe the distance along the view axis of every pixel, too")
+    segmentation: bool = Field(
+        False, description="observe what every pixel shows, too: 0 ground and sky, then the number of the subject"
+    )
+    farthest: float = Field(
+        20.0, gt=0.0, le=FARTHEST, description="depth of the sky and of everything beyond, which is cut off there [m]"
     )
 
 
@@ -664,10 +725,20 @@ PRESETS: dict[str, dict[str, dict[str, float]]] = {
 
 
 class EnvConfig(BaseModel):
-    """Settings of every environment; a task adds its own in a subclass."""
+    """Settings of every environment; a task adds its own in a subclass.
+
+    Class attributes:
+        presets: settings of each value of ``preset``, by section.
+        bare_names: what bare names mean that several sections have, or that name a section within one.
+    """
 
     model_config = FROZEN
     presets: ClassVar[Mapping[str, Mapping[str, Mapping[str, Any]]]] = PRESETS
+    bare_names: ClassVar[Mapping[str, str]] = {
+        "width": "render.width",
+        "height": "render.height",
+        "camera": "pixels.camera",
+    }
 
     preset: Literal["firm", "soft", "limp"] | None = Field(
         None,
@@ -681,6 +752,7 @@ class EnvConfig(BaseModel):
     randomize: RandomizeConfig = Field(default_factory=RandomizeConfig, description="factors that every episode draws")
     scene: SceneConfig = Field(default_factory=SceneConfig, description="avatars, props, colliders and their contact")
     render: RenderConfig = Field(default_factory=RenderConfig, description="pictures")
+    pixels: PixelsConfig = Field(default_factory=PixelsConfig, description="pictures as observations")
     episode_seconds: float = Field(5.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     joints: tuple[str, ...] | None = Field(
         None, description="joints that act; the others keep their reference pose; null for all 21"
@@ -690,9 +762,16 @@ class EnvConfig(BaseModel):
         description="observe the parameters that the episode has drawn (randomize, random shapes, the task), the "
         "current root_assist under pd and torque, and the episode's clock",
     )
-    obs_mode: Literal["flat", "dict"] = Field(
-        "flat", description="observations as one float32 vector (flat) or by name (dict)"
+    obs_mode: Literal["flat", "dict", "pixels", "pixels+state"] = Field(
+        "flat",
+        description="observations as one float32 vector (flat), by name (dict), as pictures (pixels), or as pictures "
+        "beside the vector (pixels+state)",
     )
+
+    @property
+    def observes_pixels(self) -> bool:
+        """Whether observations are pictures, or have some."""
+        return self.obs_mode in ("pixels", "pixels+state")
 
     @model_validator(mode="after")
     def _check_avatars(self) -> EnvConfig:

@@ -26,6 +26,7 @@ from piavatar_envs.envs.episodes import (
     seeds_as_int32,
 )
 from piavatar_envs.envs.observer import Observer
+from piavatar_envs.envs.pixels import PixelObserver
 from piavatar_envs.envs.state import (
     SETTINGS,
     add_forces,
@@ -70,6 +71,7 @@ class BatchEnv(EpisodeArrays):
         action_spec: the joints that act.
         action_map: from action components to joints, on the device.
         observer: writes the observation.
+        pixels: draws the pictures that agents observe, or None.
         files: digests of the files that settings name.
         restarts: number of calls that made time jump: of :meth:`reset` and :meth:`set_state`.
     """
@@ -107,6 +109,7 @@ class BatchEnv(EpisodeArrays):
         task.allocate_declared(self)
         task.allocate(self)
         self.observer.connect(self)
+        self.pixels: PixelObserver | None = PixelObserver(self, task) if self.config.observes_pixels else None
         self.reset_graph = LaunchGraph(self.device, condition=self.begins)
         self.step_graph, self.observe_graph = LaunchGraph(self.device), LaunchGraph(self.device)
         self.count_graph, self.ended_graph = LaunchGraph(self.device), LaunchGraph(self.device)
@@ -241,6 +244,8 @@ class BatchEnv(EpisodeArrays):
                 self.task.record_observe(self, graph, agent, self.observer.task_start)
             self.observer.record_parameters(graph, self, agent)
         self.observer.record_clean(graph, self.observation)
+        if self.pixels:
+            self.pixels.record(graph, mask)
 
     # state
 

@@ -21,7 +21,7 @@ from piavatar_envs.core.reading import UNREADABLE, files_behind
 #: Name of the settings in a state.
 SETTINGS = "env.settings"
 #: Settings without effect on the future, and the setting that a state holds as a number of its own.
-_SHOWN, _BEGUN_WITH = ("render", "obs_mode"), "root_assist"
+_SHOWN, _BEGUN_WITH = ("render", "pixels", "obs_mode"), "root_assist"
 #: Arrays that may hold numbers that are not finite: the next step finds them and ends the episode with a failure.
 _FOUND_BY_STEPS = ("particles.x", "particles.u", "particles.C", "particles.F")
 #: How the names of external forces begin; a state has them only after the first force.

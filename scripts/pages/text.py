@@ -117,7 +117,8 @@ def _overview(entry: Entry, facts: Facts) -> str:
         ("action", code(f"Box(-1, 1, ({facts.actions.size},), float32)")),
         (
             "observation",
-            f'{code(f"Box(-inf, inf, ({facts.layout.size},), float32)")}, or a `Dict` with `obs_mode="dict"`',
+            f'{code(f"Box(-inf, inf, ({facts.layout.size},), float32)")}, a `Dict` with `obs_mode="dict"`, or '
+            '[pictures](../pixels.md) with `obs_mode="pixels"`',
         ),
         ("control step", f"{_duration(dt)}, {round(seconds / dt)} of them in an episode of {number(seconds)} s"),
         ("source", f"[{entry.source.as_posix()}]({_relative(ROOT / entry.source)})"),

@@ -27,7 +27,7 @@ KICK = "PIAvatar/KickBall-v0"
         ({"bogus": 1}, ["bogus", "obs_mode"]),
         ({"fidelty": "tiny"}, ["fidelty", "physics.fidelity"]),
         ({"fidelity": "ultra"}, ["physics.fidelity='ultra'", "'tiny'", "'coarse'"]),
-        ({"obs_mode": "pixels"}, ["obs_mode='pixels'", "'flat'", "'dict'"]),
+        ({"obs_mode": "image"}, ["obs_mode='image'", "'flat'", "'dict'"]),
         ({"control": "pose", "tone": 2.0}, ["control.tone=2.0", "<= 1"]),
         ({"root_assist": 1.0, "tone": 0.5}, ["control.root_assist=1.0", "control.mode='pd'"]),
         ({"config": {"control": {"tune": 1}}}, ["control.tune", "control.tone"]),

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import piavatar_envs
-from piavatar_envs.api.pictures import SHOWN_HEIGHT, camera_of
 from piavatar_envs.avatar.body.sources import list_sources, load_asset
 from piavatar_envs.avatar.motion import list_motions, load_motion
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.envs.pixels import SHOWN_HEIGHT, task_camera
 from piavatar_envs.envs.state import file_digests
 from piavatar_envs.sim.world import Simulation
 from piavatar_envs.tasks.track_motion import TrackMotionConfig
@@ -236,7 +236,7 @@ def test_small_and_tall_bodies_have_room(device, height):
     env.reset(seed=0)
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert info["failure"] == 0
-    camera, shown = camera_of(env.batch), 2.95 / SHOWN_HEIGHT if height > 2.0 else 1.0
+    camera, shown = task_camera(env.batch, env.batch.task), 2.95 / SHOWN_HEIGHT if height > 2.0 else 1.0
     np.testing.assert_allclose(camera.position, shown * np.array(env.batch.task.camera_position), rtol=0.05)
     env.close()
 

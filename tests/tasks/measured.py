@@ -7,9 +7,10 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.api.pictures import SceneReader, camera_of
+from piavatar_envs.api.pictures import SceneReader
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.pixels import task_camera
 from piavatar_envs.sim.markers import Markers, allocate_markers
 
 
@@ -95,6 +96,6 @@ def assert_all_is_seen(env, seeds=range(3)) -> None:
         scene = scenes.scene(0)
         points = [body.vertices for body in scene.bodies] + [marker.mesh()[0] for marker in scene.markers]
         center = (0.0, 0.0) if scene.follow is None else scene.follow[:2]
-        seen = places_in(camera_of(batch), np.concatenate(points), center)
+        seen = places_in(task_camera(batch, batch.task), np.concatenate(points), center)
         assert np.abs(seen).max() < 1.0
         assert np.ptp(seen[:, 1]) > 0.3  # and not a dot

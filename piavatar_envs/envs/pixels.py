@@ -1,0 +1,144 @@
+"""Pictures that agents observe: drawn for all environments at the end of a recorded step."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.config import PixelsConfig, PlacedCamera
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.episodes import EpisodeArrays
+from piavatar_envs.envs.task import Task
+from piavatar_envs.render.cameras import BatchCamera
+from piavatar_envs.render.painter import Painter
+from piavatar_envs.render.scene import Camera
+from piavatar_envs.render.stage import Stage
+
+wp.set_module_options({"enable_backward": False})
+
+#: Height of the bodies that tasks place their cameras for, at most [m].
+SHOWN_HEIGHT = 1.8
+
+
+class PixelObserver:
+    """Draws what agents observe under ``obs_mode="pixels"`` and ``"pixels+state"``.
+
+    A picture is a function of the state alone: cameras do not glide, and nothing is kept from one step to the next.
+
+    Attributes:
+        stage: the surfaces of all environments.
+        arrays: by name, an array for each agent: ``"pixels"`` ``(num_envs, height, width, 3)`` uint8, ``"depth"``
+            ``(num_envs, height, width, 1)`` float32 [m], ``"segmentation"`` ``(num_envs, height, width, 1)`` uint8.
+            Agents that see through the same camera share them.
+    """
+
+    def __init__(self, env: EpisodeArrays, task: Task) -> None:
+        """Build the surfaces, and allocate the pictures.
+
+        Raises:
+            ConfigError: the task has markers that only the host can draw.
+        """
+        task.check_pixels()
+        self._env, self._task = env, task
+        settings, simulation, device = task.config.pixels, env.simulation, env.device
+        self.stage = Stage(simulation, task.marker_specs())
+        of_each_agent = settings.camera.kind not in ("task", "placed")
+        size = settings.height, settings.width
+        self._eyes: list[tuple[BatchCamera, Painter]] = []
+        for agent in range(env.num_agents if of_each_agent else 1):
+            painter = Painter(
+                self.stage.surfaces,
+                env.num_envs,
+                *size,
+                device,
+                depth=settings.depth,
+                segmentation=settings.segmentation,
+                vertices=self.stage.vertices,
+            )
+            painter.layers += self.stage.layers(*size)
+            out = painter.views, painter.centers
+            self._eyes.append((_camera_of(settings, task, env, self.stage, agent, out), painter))
+        self._all = wp.full(env.num_envs, True, dtype=wp.bool, device=device)
+        shape = (env.num_envs, *size, 1)
+        self._farthest, painters = settings.farthest, [painter for _, painter in self._eyes]
+        views = {"pixels": [painter.picture for painter in painters]}
+        if settings.depth:
+            views["depth"] = [wp.zeros(shape, dtype=float, device=device) for _ in painters]
+        if settings.segmentation:
+            views["segmentation"] = [painter.labels.reshape(shape) for painter in painters]
+        self._views = views
+        agents = range(env.num_agents)
+        self.arrays = {name: [own[agent % len(own)] for agent in agents] for name, own in views.items()}
+
+    def record(self, graph: LaunchGraph, mask: wp.array | None = None) -> None:
+        """Record the launches that draw the present state.
+
+        Args:
+            graph: records.
+            mask: environments whose pictures change, ``(num_envs,)`` bool; all if not given.
+        """
+        # layers are drawn over a picture of surfaces, not over an earlier one of their own
+        chosen = self._all if mask is None or self.stage.splats else mask
+        self._task.record_markers(self._env, graph, self.stage.markers)
+        self.stage.record(graph)
+        for camera, painter in self._eyes:
+            camera.record(graph)
+            graph.launch(choose, len(painter.drawn), [chosen], [painter.drawn])
+            painter.record(graph)
+        for (_, painter), depth in zip(self._eyes, self._views.get("depth", ()), strict=False):
+            graph.launch(cut_depth, depth.shape[:3], [painter.depth, self._farthest], [depth])
+
+
+def _camera_of(
+    settings: PixelsConfig, task: Task, env: EpisodeArrays, stage: Stage, agent: int, out: tuple[wp.array, wp.array]
+) -> BatchCamera:
+    """Return the camera that an agent sees through.
+
+    Args:
+        settings: of the pictures.
+        task: whose camera ``"task"`` is.
+        env: the environments.
+        stage: what is seen, one picture an environment.
+        agent: index of the agent.
+        out: arrays of views and centers that the camera writes.
+    """
+    chosen, camera, follows = settings.camera, settings.camera.kind, True
+    angle = settings.field_of_view
+    if isinstance(chosen, PlacedCamera):
+        camera, follows = Camera(chosen.position, chosen.target, angle or Camera().field_of_view), chosen.follows
+    elif chosen.kind == "task":
+        camera, follows = task_camera(env, task, angle), task.camera_follows
+    size = settings.width, settings.height
+    return BatchCamera(
+        env.simulation, camera, *size, stage.envs, follows=follows, agent=agent, field_of_view=angle, out=out
+    )
+
+
+def task_camera(env: EpisodeArrays, task: Task, field_of_view: float | None = None) -> Camera:
+    """Return the task's camera, farther from bodies taller than :data:`SHOWN_HEIGHT` unless settings place it.
+
+    Args:
+        env: the environments.
+        task: of theirs.
+        field_of_view: vertical angle instead of the camera's own [deg].
+    """
+    render = task.config.render
+    size = max(1.0, max(flesh.height for flesh in env.simulation.flesh) / SHOWN_HEIGHT)
+    if render.camera_position is not None or render.camera_target is not None:
+        size = 1.0
+    position, target = (tuple(size * value for value in place) for place in (task.camera_position, task.camera_target))
+    return Camera(position, target, field_of_view or Camera().field_of_view)
+
+
+@wp.kernel
+def choose(mask: wp.array(dtype=wp.bool), drawn: wp.array(dtype=wp.bool)):
+    """Choose the pictures that change."""
+    e = wp.tid()
+    drawn[e] = mask[e]
+
+
+@wp.kernel
+def cut_depth(distance: wp.array3d(dtype=float), farthest: float, depth: wp.array4d(dtype=float)):
+    """Cut depth off, and give the sky the greatest."""
+    e, i, j = wp.tid()
+    here = distance[e, i, j]
+    depth[e, i, j, 0] = wp.where(here < farthest, wp.max(here, 0.0), farthest)
