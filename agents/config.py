@@ -85,7 +85,7 @@ def load_resolved(
     """Load a configuration with a section ``env`` and fill in the environment's defaults.
 
     Args:
-        cls: of the configuration.
+        cls: of the configuration; its attribute ``obs_modes`` names what its networks take, if more than vectors.
         env_class: the environment's configuration class; a ValueError where there is no such environment.
         source: a YAML file or a mapping.
         overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
@@ -100,8 +100,10 @@ def load_resolved(
         env = load_config(env_class(config), config.env, for_env)
     except ValueError as error:
         raise ConfigError(f"env: {error}" if isinstance(error, ConfigError) else f"env_id: {error}") from None
-    if env.obs_mode != "flat":
-        raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
+    modes = getattr(cls, "obs_modes", ("flat",))
+    if env.obs_mode not in modes:
+        known = " or ".join(map(repr, modes))
+        raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be {known} to train; choose terms with observe")
     return config.model_copy(update={"env": FrozenDict(env.model_dump(mode="json"))})
 
 

@@ -33,7 +33,9 @@ from agents.intervals import (
 )
 from piavatar_envs.api.host import EpisodeHost
 
-Agent = Callable[[np.ndarray], np.ndarray]
+#: An observation: an array, or a mapping of ``"state"`` to it and of pictures by their names.
+Seen = np.ndarray | Mapping[str, np.ndarray]
+Agent = Callable[[Seen], np.ndarray]
 #: Width of a class of pushes [N s].
 PUSH_CLASS = 5.0
 #: Metrics of TrackMotion, their names in rows, and factors to the units of Luo et al., "Perpetual humanoid control for
@@ -343,7 +345,8 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
 
     Args:
         name: the agent's, for tables.
-        agent: from observations ``(num_envs, num_agents, size)`` to actions ``(num_envs, num_agents, action_size)``.
+        agent: from observations ``(num_envs, num_agents, size)`` to actions ``(num_envs, num_agents, action_size)``;
+            where pictures are observed, from a mapping of ``"state"`` to these and of pictures by their names.
         batch: of NumPy arrays; whatever it was playing is given up.
         first_seed: environment ``i`` plays the episode of ``first_seed + i``.
     """
@@ -359,7 +362,7 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
     with episode_bar(name, batch.num_envs, mininterval=seconds, dynamic_ncols=True) as bar:
         while playing.any():
             acted = batch.alive()
-            batch.step(agent(batch.observation()))
+            batch.step(agent(seen_by(batch)))
             # that of an agent that is out is what it was in its last step
             success = np.where(acted, batch.read(lambda group: group.success), success)
             metrics = batch.read(lambda group: group.metrics)
@@ -379,6 +382,20 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
     return Evaluation(name, episodes, batch.task.motion_names)
 
 
+def seen_by(batch: EpisodeHost) -> Seen:
+    """Return the present observations of a batch, as :func:`play` gives them to agents."""
+    pictures = batch.observed_pictures(0)  # no learner here has both pictures and several agents
+    flat = batch.observation()
+    return {"state": flat, **{name: values[:, None] for name, values in pictures.items()}} if pictures else flat
+
+
+def each_array(function: Callable[..., np.ndarray], *observations: Seen) -> Seen:
+    """Apply a function to the arrays of observations, those of mappings by name."""
+    if isinstance(observations[0], Mapping):
+        return {name: function(*(own[name] for own in observations)) for name in observations[0]}
+    return function(*observations)
+
+
 def play_with_baselines(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> list[Evaluation]:
     """Play zero actions, random actions and the agent in the same episodes; arguments as for :func:`play`."""
     players = {other: for_all_seats(player) for other, player in baselines(batch.action_size, first_seed).items()}
@@ -388,7 +405,8 @@ def play_with_baselines(name: str, agent: Agent, batch: EpisodeHost, first_seed:
 def for_all_seats(agent: Agent) -> Agent:
     """Turn an agent for observations ``(n, size)`` into one that :func:`play` takes."""
 
-    def act(observation: np.ndarray) -> np.ndarray:
+    def act(observation: Seen) -> np.ndarray:
+        observation = observation["state"] if isinstance(observation, Mapping) else observation
         envs, agents = observation.shape[:2]
         return agent(observation.reshape(envs * agents, -1)).reshape(envs, agents, -1)
 

@@ -25,13 +25,14 @@ from tqdm import tqdm
 from agents.checkpoint import read_checkpoint
 from agents.command import one_line_errors, read_options
 from agents.config import EvaluationSettings, changed, check_imports
-from agents.evaluate import Agent, begin_round, for_all_seats, play
+from agents.evaluate import Agent, begin_round, each_array, for_all_seats, play
 from agents.files import CHECKPOINT, RESULTS, check_figures
 from agents.report import show_table, versions, write_results
 from agents.sb3.config import load_training
 from agents.sb3.workers import EnvFactory, start_workers
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import ConfigError, load_config, parse_assignments, read_yaml
+from piavatar_envs.config import replace as replace_settings
 from piavatar_envs.core.rng import check_seeds
 from piavatar_envs.core.writing import check_writable
 from piavatar_envs.doctor import quiet_warp
@@ -54,7 +55,7 @@ class Run:
         evaluation: of the training.
         observe: terms of the observation that the policy sees; None for all.
         make_agent: the agent, from the layout of the observation and the length of an action; its observations are
-            ``(num_envs, 1, size)``.
+            ``(num_envs, 1, size)``, or as :func:`agents.evaluate.seen_by` returns them.
     """
 
     env_id: str
@@ -197,7 +198,8 @@ def environment(run: Run, assignments: Sequence[str]) -> Task:
     """
     given = [assignment.removeprefix("env.") for assignment in assignments]
     task_class = load_task(run.env_id)
-    trained = task_class(load_config(task_class.Config, run.env, {"obs_mode": "flat"}))
+    learnt = load_config(task_class.Config, run.env)
+    trained = task_class(replace_settings(learnt, obs_mode="pixels+state" if learnt.observes_pixels else "flat"))
     task = task_class(load_config(task_class.Config, trained.config, parse_assignments(given)))
     if unlike := changed(trained, task, run.observe):
         alone = [one for one in given if _changes_alone(trained, one, run.observe)]
@@ -243,7 +245,13 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
     first = first_seed(run, options)
     made = EnvFactory(run.env_id, env, options.device)()
     agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
-    watch_env(made, lambda seen: agent(seen[None, None])[0, 0], first, options.port, lambda: begin_round(agent, 1))
+    watch_env(
+        made,
+        lambda seen: agent(each_array(lambda own: own[None, None], seen))[0, 0],
+        first,
+        options.port,
+        lambda: begin_round(agent, 1),
+    )
 
 
 def score_run(agent: Agent, batch: EpisodeHost, first: int, options: Options, env: dict[str, Any]) -> None:
@@ -266,7 +274,7 @@ def score_run(agent: Agent, batch: EpisodeHost, first: int, options: Options, en
 def film_run(run: Run, agent: Agent, seconds: float, first: int, options: Options, env: dict[str, Any]) -> None:
     """Film episodes; arguments as for :func:`score_run`, and ``seconds``, the time of a control step."""
     make = EnvFactory(run.env_id, env, options.device)
-    alone = {options.run.name: lambda observation: agent(observation[:, None])[:, 0]}
+    alone = {options.run.name: lambda observation: agent(each_array(lambda own: own[:, None], observation))[:, 0]}
     film(options.film, make, alone, range(first, first + options.film_episodes), 1.0 / seconds, options.film_every)
     print(f"wrote {options.film}")
 
@@ -336,7 +344,8 @@ def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], ever
     for seed in tqdm(seeds, desc="film", unit="episode"):
         for agent in agents.values():
             begin_round(agent, 1)
-        observation = np.stack([first for first, _ in halves.env_method("reset", seed=int(seed))])
+        started = [first for first, _ in halves.env_method("reset", seed=int(seed))]
+        observation = each_array(lambda *rows: np.stack(rows), *started)
         totals, playing = np.zeros(len(agents)), np.ones(len(agents), bool)
         shown: list[np.ndarray] = []
         for step in count():
@@ -347,7 +356,8 @@ def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], ever
                 texts = [f"{name}: {total:.0f}" for name, total in zip(agents, totals, strict=True)]
                 labelled = [label(picture, text) for picture, text in zip(shown, texts, strict=True)]
                 yield side_by_side(*labelled) if len(agents) == 2 else labelled[0]
-            action = np.stack([agent(observation[i : i + 1])[0] for i, agent in enumerate(agents.values())])
+            rows = [each_array(lambda own, i=i: own[i : i + 1], observation) for i in range(len(agents))]
+            action = np.stack([agent(row)[0] for agent, row in zip(agents.values(), rows, strict=True)])
             observation, rewards, dones, _ = halves.step(action)
             totals += rewards * playing
             playing &= ~dones

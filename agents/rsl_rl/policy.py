@@ -2,27 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from agents.batch_training import BatchTraining, load_batched
 from agents.checkpoint import load_weights, policy_mismatch, read_checkpoint
 from agents.config import Widths
-from agents.evaluate import Agent
+from agents.evaluate import Agent, Seen
 from agents.files import CHECKPOINT
 from agents.rsl_rl.curriculum import AssistSchedule, MotionSchedule
 from agents.sb3.workers import components
-from piavatar_envs.config import FROZEN, FrozenDict
+from piavatar_envs.api.host import picture_spaces
+from piavatar_envs.api.rsl_rl import picture_groups
+from piavatar_envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
 from piavatar_envs.core.reading import UNREADABLE
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
+
+
+class ConvolutionSettings(BaseModel):
+    """Convolutions before the hidden layers of each network.
+
+    The defaults are those of Mnih et al., "Human-level control through deep reinforcement learning", Nature 2015.
+    """
+
+    model_config = FROZEN
+
+    channels: Widths = Field((32, 64, 64), min_length=1, description="channels after each convolution")
+    kernels: Widths = Field((8, 4, 3), min_length=1, description="widths of the kernels [pixel]")
+    strides: Widths = Field((4, 2, 1), min_length=1, description="strides [pixel]")
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> ConvolutionSettings:
+        """Refuse lists of different lengths."""
+        if not len(self.channels) == len(self.kernels) == len(self.strides):
+            raise ConfigError(
+                f"channels={list(self.channels)}, kernels={list(self.kernels)} and strides={list(self.strides)} must "
+                "have one entry a convolution each"
+            )
+        return self
 
 
 class RslPPOSettings(BaseModel):
@@ -62,10 +87,19 @@ class RslPPOSettings(BaseModel):
     )
     mirrored: bool = Field(False, description="whether it also learns from every step as it is in a mirror")
     hidden: Widths = Field((128, 128), min_length=1, description="widths of the hidden layers of both networks")
+    convolutions: ConvolutionSettings = Field(
+        default_factory=ConvolutionSettings, description="layers before these, which see pictures"
+    )
 
 
 class RslTraining(BatchTraining):
-    """Settings of a training with rsl_rl."""
+    """Settings of a training with rsl_rl.
+
+    Class attributes:
+        obs_modes: what the networks take.
+    """
+
+    obs_modes: ClassVar[tuple[str, ...]] = ("flat", "pixels", "pixels+state")
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
     ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
@@ -87,20 +121,50 @@ def load_rsl(
     return load_batched(RslTraining, load_task, source, overrides)
 
 
-def network_settings(ppo: RslPPOSettings) -> dict[str, Any]:
-    """Return the settings of a network as rsl_rl takes them."""
-    return {
+def network_settings(ppo: RslPPOSettings, sees: Collection[str]) -> dict[str, Any]:
+    """Return the settings of a network as rsl_rl takes them.
+
+    Args:
+        ppo: the algorithm's.
+        sees: names of the observation groups that it sees.
+    """
+    settings = {
         "class_name": "MLPModel",
         "hidden_dims": list(ppo.hidden),
         "activation": "tanh",
         "obs_normalization": ppo.normalize_observation,
     }
+    if set(sees) == {"policy"}:
+        return settings
+    layers = ppo.convolutions
+    convolutions = {
+        "output_channels": list(layers.channels),
+        "kernel_size": list(layers.kernels),
+        "stride": list(layers.strides),
+        "activation": "relu",
+    }
+    return settings | {"class_name": "CNNModel", "cnn_cfg": convolutions}
 
 
-def actor_settings(ppo: RslPPOSettings) -> dict[str, Any]:
-    """Return the settings of the actor, whose outputs are means of a Gaussian."""
+def actor_settings(ppo: RslPPOSettings, sees: Collection[str]) -> dict[str, Any]:
+    """Return the settings of the actor, whose outputs are means of a Gaussian; arguments as for the network."""
     spread = {"class_name": "GaussianDistribution", "init_std": ppo.action_std, "std_type": "log"}
-    return network_settings(ppo) | {"distribution_cfg": spread}
+    return network_settings(ppo, sees) | {"distribution_cfg": spread}
+
+
+def shown_groups(config: RslTraining, components: int) -> TensorDict:
+    """Return an observation of zeros, by the groups that the networks see: ``policy``, and pictures by their names.
+
+    Args:
+        config: resolved.
+        components: of the flat observation that are seen.
+    """
+    settings: EnvConfig = load_config(load_task(config.env_id).Config, config.env)
+    groups = {} if settings.obs_mode == "pixels" else {"policy": torch.zeros(1, components)}
+    if settings.observes_pixels:
+        spaces = picture_spaces(settings.pixels)
+        groups |= {name: torch.zeros(1, *np.moveaxis(np.empty(s.shape), -1, 0).shape) for name, s in spaces.items()}
+    return TensorDict(groups, [1])
 
 
 def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, action_size: int, device: str) -> Agent:
@@ -117,10 +181,10 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
         ConfigError: the file holds no policy of that configuration.
     """
     seen = components(layout, config.observe)
-    settings = actor_settings(config.ppo)
+    shown = shown_groups(config, len(seen))
+    settings = actor_settings(config.ppo, shown.keys())
     network = resolve_callable(settings.pop("class_name"))
-    shown = TensorDict({"policy": torch.zeros(1, len(seen))}, [1])
-    actor = network(shown, {"actor": ["policy"]}, "actor", action_size, **settings).to(device)
+    actor = network(shown, {"actor": list(shown.keys())}, "actor", action_size, **settings).to(device)
     try:
         interrupted = path.name == CHECKPOINT
         actor.load_state_dict(
@@ -138,13 +202,16 @@ def mean_agent(actor: torch.nn.Module, seen: Sequence[int], device: str) -> Agen
 
     Args:
         actor: rsl_rl's.
-        seen: components of the observation that it sees.
+        seen: components of the flat observation that it sees.
         device: its.
     """
 
-    def act(observation: np.ndarray) -> np.ndarray:
-        shown = torch.as_tensor(observation[:, 0][:, seen], device=device)
+    def act(observation: Seen) -> np.ndarray:
+        own = observation if isinstance(observation, Mapping) else {"state": observation}
+        pictures = {name: torch.as_tensor(own[name][:, 0], device=device) for name in own if name != "state"}
+        state = torch.as_tensor(own["state"][:, 0][:, seen], device=device)
+        groups = TensorDict({"policy": state} | picture_groups(pictures), [len(state)])
         with torch.no_grad():
-            return actor(TensorDict({"policy": shown}, [len(shown)]))[:, None].cpu().numpy()
+            return actor(groups)[:, None].cpu().numpy()
 
     return act

@@ -174,13 +174,15 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
     Raises:
         ConfigError: steps cannot be mirrored.
     """
-    ppo = config.ppo
+    ppo, sees = config.ppo, list(env.get_observations().keys())
+    if ppo.mirrored and sees != ["policy"]:
+        raise ConfigError("ppo.mirrored is for vectors, and the networks see pictures; leave it out")
     return {
         "num_steps_per_env": ppo.rollout_steps,
         "save_interval": config.checkpoint_every,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-        "actor": actor_settings(ppo),
-        "critic": network_settings(ppo),
+        "obs_groups": {"actor": sees, "critic": sees},
+        "actor": actor_settings(ppo, sees),
+        "critic": network_settings(ppo, sees),
         "algorithm": {
             "class_name": ScaledPPO,
             "reward_scale": ppo.reward_scale,

@@ -67,7 +67,7 @@ class Worlds(AvatarSkrlMultiEnv):
         if self.saved is None:
             return begun
         self.host.set_state(self.saved)
-        return self._named(self.host.observation()), {"alive": self._by_agent(self.host.alive())}
+        return self._now()
 
 
 class WorldMAPPO(MAPPO):

@@ -53,6 +53,10 @@ TRAININGS = {
         "configs/rsl_rl/reach_rsl.yaml", "num_envs=2", "iterations=2", "ppo.rollout_steps=4", "ppo.minibatches=1",
         "ppo.epochs=1",
     ),
+    "pixels": (
+        "configs/rsl_rl/reach_pixels_rsl.yaml", "num_envs=2", "iterations=2", "ppo.rollout_steps=4",
+        "ppo.minibatches=1", "ppo.epochs=1", "env.pixels.width=36", "env.pixels.height=36",
+    ),
     "ppo": ("configs/sb3/reach_sb3.yaml", "total_steps=16", "num_workers=2", "ppo.rollout_steps=8", "ppo.batch_size=8"),
     "sac": ("configs/sb3/reach_sac.yaml", "total_steps=16", "num_workers=2", "sac.first_random=4", "sac.batch_size=4"),
 }  # fmt: skip
@@ -64,7 +68,7 @@ def run_of(device, tmp_path_factory):
     root = tmp_path_factory.mktemp("runs")
 
     def run(kind: str):
-        if kind == "rsl":
+        if kind in ("rsl", "pixels"):
             for needed in ("rsl_rl", "tensordict", "git"):
                 pytest.importorskip(needed, reason="needs the extra rsl")
             from agents.rsl_rl import train as script
