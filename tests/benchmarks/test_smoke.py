@@ -19,7 +19,7 @@ from benchmarks.paper.stage import Act, keyed, perform
 from benchmarks.physics import blows, contact, elastodynamics, stability, torque, wear
 from benchmarks.physics.limbs import Options
 from benchmarks.physics.rig import Rig, World
-from benchmarks.speed import cpu, failures, plain_mpm, profile, soak, steps, vector
+from benchmarks.speed import cpu, failures, pixels, plain_mpm, profile, soak, steps, vector
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import PoseControlConfig
@@ -41,6 +41,14 @@ def check_finite(rows: list[dict]) -> None:
     """Assert that there are rows, all of finite numbers and without failures."""
     numbers = [v for row in rows for v in row.values() if isinstance(v, (int, float, np.number))]
     assert rows and all(map(math.isfinite, numbers)) and not any(row.get("failed") for row in rows)
+
+
+def test_pictures_are_counted(tmp_path, device):
+    arguments = ("--fidelity", "tiny", "--seconds", "0.01", "--repeats", "1", "--num-envs", "2", "--sizes", "16")
+    (row,) = run(pixels, tmp_path / "pixels.json", device, *arguments, "--worlds", "PIAvatar/Reach-v0")
+    assert row["refused"] is None and (row["num_envs"], row["size"]) == (2, 16)
+    assert min(row[name] for name in ("frames_per_s", "drawing_only", "without_pixels", "with_autoreset")) > 0.0
+    assert len(row["drawing_ms_by_kernel"]) > 5 and row["launches_of_drawing"] > 5
 
 
 def test_vector_rates_are_consistent(tmp_path, device):
