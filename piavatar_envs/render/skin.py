@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import warp as wp
+from scipy import sparse
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body import interpolation
 from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.interpolation import interpolation_matrix
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
@@ -29,6 +31,7 @@ from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.skinning import blend_places, in_order, pack
 from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.result_cache import digest_of, kept
 from piavatar_envs.core.structs import fill
 from piavatar_envs.mpm.types import row
 
@@ -41,6 +44,8 @@ wp.set_module_options({"enable_backward": False})
 #: Particles that move a vertex. With few, what neighbours differ by crumples the skin where it is finer than they are:
 #: toes on the ground, between bones that are put into their places and flesh that is not.
 NUM_NEIGHBOURS = 24
+#: Joints that move points, and their weights, both shape ``(N, K)``.
+Skinning = tuple[np.ndarray, np.ndarray]
 #: Skins that :meth:`Skin.baked` keeps in a process.
 _MOST_BAKED = 8
 #: Particles that move a vertex of a prop.
@@ -280,8 +285,8 @@ class Skin:
         self._rest_joints = np.asarray(body.joints, np.float64)
         self._vertex_skin = pack(*in_order(np.asarray(asset.skin_joints), np.asarray(asset.skin_weights)))
         self._particle_skin = pack(*in_order(np.asarray(skin_joints), np.asarray(skin_weights)))
-        own, others = (dense_weights(asset.skin_joints, asset.skin_weights), dense_weights(skin_joints, skin_weights))
-        self._interpolation = interpolation_matrix(self._rest, own, self._particles, others, NUM_NEIGHBOURS)
+        skinnings = (asset.skin_joints, asset.skin_weights), (skin_joints, skin_weights)
+        self._interpolation = _interpolation(self._rest, self._particles, *skinnings)
         self._pose: PoseDisplacements | None = getattr(asset, "pose", None)
         self._correctives = correctives if self._pose is not None else None
         self._uploaded: dict[tuple[str, int], tuple[AvatarAsset | None, SkinSurface]] = {}
@@ -428,6 +433,28 @@ class Skin:
     def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
         """Interpolate a quantity of the particles on the skin, shape ``(P, ...)`` to ``(V, ...)``."""
         return self._interpolation @ np.asarray(per_particle, dtype=np.float64)
+
+
+def _interpolation(vertices: np.ndarray, particles: np.ndarray, own: Skinning, others: Skinning) -> sparse.csr_array:
+    """Return the weights of particles at vertices, shape ``(V, P)``, from a file if they take long to compute.
+
+    Args:
+        vertices: in the rest pose [m], shape ``(V, 3)``.
+        particles: likewise, shape ``(P, 3)``.
+        own: joints and weights of the vertices.
+        others: those of the particles.
+    """
+
+    def compute() -> dict[str, np.ndarray]:
+        weights = dense_weights(*own), dense_weights(*others)
+        found = interpolation_matrix(vertices, weights[0], particles, weights[1], NUM_NEIGHBOURS)
+        return {name: getattr(found, name) for name in ("data", "indices", "indptr")}
+
+    given = [vertices, particles, *map(np.asarray, (*own, *others)), NUM_NEIGHBOURS]
+    doing = f"binding {len(vertices)} points to {len(particles)} particles"
+    arrays = kept("bound", digest_of(given, [interpolation]), compute, doing)
+    parts = (arrays["data"], arrays["indices"], arrays["indptr"])
+    return sparse.csr_array(parts, shape=(len(vertices), len(particles)))
 
 
 #: Skins by the digest of what they were baked from, the one that was used last at the end.
