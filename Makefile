@@ -58,7 +58,8 @@ test-lowest: install
 	PYTHONPATH=$(LOWEST) $(PYTEST) tests/api/test_gymnasium.py tests/api/test_vector.py tests/multi/test_api.py \
 	  -k "not picture and not camera and (test_gymnasium or Kick or pettingzoo or wrappers or first_reset)"
 
-# Files and implementations of other projects that readers of avatars and motions are compared with, in a folder of their own.
+# Files and implementations of other projects that readers of avatars and motions, and films, are compared with, in a folder of
+# their own.
 REFERENCES := $(VENV)/references
 $(REFERENCES)/.installed: $(STAMP) tests/avatar/requirements.txt
 	rm -rf $(REFERENCES)
@@ -66,7 +67,7 @@ $(REFERENCES)/.installed: $(STAMP) tests/avatar/requirements.txt
 	@touch $@
 
 test-avatars: $(REFERENCES)/.installed
-	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py splats.py) -k "makehuman or published or body_models or pybvh or gsply"
+	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py splats.py) tests/render/test_film_files.py -k "makehuman or published or body_models or pybvh or gsply or usd"
 
 # Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
 # imports and compilation take longer than the tests.
