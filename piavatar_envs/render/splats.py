@@ -19,6 +19,7 @@ import warp as wp
 
 from piavatar_envs.core.arrays import vec6, vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render.raster import NEAR
 from piavatar_envs.render.views import View
 
 wp.set_module_options({"enable_backward": False})
@@ -38,12 +39,10 @@ _DEPTH_BITS = 27
 _TILE = wp.constant(TILE)
 _PIXELS_OF_TILE = wp.constant(TILE * TILE)
 _DEPTH_KEYS = wp.constant(wp.uint32(_DEPTH_BITS))
-# Depths from 1/8 m to 2^13 m have 16 exponents, so that their bits above those of the first need 27 bits.
-_NEAREST, _FURTHEST = wp.constant(0.125), wp.constant(8192.0)
-_NEAREST_BITS = wp.constant(wp.uint32(np.float32(0.125).view(np.uint32)))
+# Depths from 2^-5 m to 2^11 m have 16 exponents, so that their bits above those of the first need 27 bits.
+_FURTHEST = wp.constant(2.0**11)
+_NEAREST_BITS = wp.constant(wp.uint32(np.float32(2.0**-5).view(np.uint32)))
 _LAST_KEY = wp.constant(wp.uint32(2**_DEPTH_BITS - 1))
-# Least distance of a centre from the eye [m], as in the reference implementation of Kerbl et al.
-_NEAR = wp.constant(0.2)
 # Variance that the reconstruction filter of a pixel adds [px^2].
 _LOW_PASS = wp.constant(0.3)
 # The projection is linearised at most this many half pictures from its axis.
@@ -136,7 +135,7 @@ def quadratic_form(covariance: vec6, a: wp.vec3, b: wp.vec3) -> float:
 @wp.func
 def is_before(depth: float) -> bool:
     """Return whether a depth [m] is one that is drawn; not that of a splat which is not a number."""
-    return depth > _NEAR and depth < _FURTHEST
+    return depth > NEAR and depth < _FURTHEST
 
 
 @wp.kernel

@@ -72,7 +72,7 @@ def reference(means, covariances, colors, opacities, background, nearest, eye=EY
     done = np.zeros((HEIGHT, WIDTH), bool)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     for i in np.argsort(z.astype(np.float32), kind="stable"):
-        if z[i] < 0.2:
+        if z[i] < 0.05:
             continue
         wide, high = np.clip([x[i] / z[i], -y[i] / z[i]], *(np.outer([-1, 1], [WIDTH, HEIGHT]) * 0.65 / FOCAL))
         jacobian = FOCAL / z[i] * np.array([axes[0] - wide * axes[2], -axes[1] - high * axes[2]])
@@ -175,7 +175,7 @@ def test_opacity_has_limits(device):
 
 
 def test_what_is_not_a_number_or_out_of_sight_is_not_drawn(device):
-    means = [[np.nan, 0, 0], [0, 0, 0], [0, -3.1, 0], [0, -2.9, 0], [0, 9e3, 0], [0, 0, 0], [500.0, 0, 0]]
+    means = [[np.nan, 0, 0], [0, 0, 0], [0, -3.1, 0], [0, -2.96, 0], [0, 9e3, 0], [0, 0, 0], [500.0, 0, 0]]
     covariances = [np.eye(3), np.full((3, 3), np.nan), *(4 * [np.eye(3)]), 1e-4 * np.eye(3)]
     opacities = [1, 1, 1, 1, 1, 0, 1]
     color, depth, _ = draw(device, [view()], means, covariances, 7 * [[1, 1, 1]], opacities, nearest=0.01)
