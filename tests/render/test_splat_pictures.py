@@ -94,3 +94,17 @@ def test_render_draws_splats_unless_colours_are_strain(make_env):
     assert (red > green + 60).sum() > 60
     strained = SceneReader(env.batch).scene(0, "strain").bodies[0]
     assert strained.splats is None and strained.scalars is not None
+
+
+def test_observed_pictures_show_splats(make_batch, equal):
+    settings = {**SPLATS, "obs_mode": "pixels", "pixels.segmentation": True}
+    batch, alone = (make_batch("PIAvatar/Reach-v0", count, **settings) for count in (3, 1))
+    batch.reset(seeds=[7, 8, 9])
+    alone.reset(seeds=[8])
+    act(batch, 2)
+    act(alone, 2, rows=slice(1, 2))
+    seen, one = ({name: rows[0].numpy() for name, rows in each.pixels.arrays.items()} for each in (batch, alone))
+    for name, rows in seen.items():
+        assert equal(rows[1], one[name][0])
+    red, green, _ = seen["pixels"][seen["segmentation"][..., 0] == 1].astype(int).T
+    assert (red > green + 60).mean() > 0.1
