@@ -116,14 +116,14 @@ class SceneReader:
         vertices = self.stage.vertices.numpy()[0].copy()
         bodies: list[Body] = []
         markers: list[Marker] = []
-        for part in self.stage.parts:
+        for number, part in enumerate(self.stage.parts):
             own = vertices[part.vertices]
             if part.kind in ("avatar", "prop"):
                 scalars = self._scalars(env, len(bodies), color)
                 splats = self._splats(len(bodies)) if color == "skin" and part.kind == "avatar" else None
                 bodies.append(Body(own, part.faces, part.color, part.colors, splats=splats, **scalars))
             elif np.isfinite(own[0, 0]):  # hidden ones are NaN
-                markers.append(Solid(part.kind, own, part.faces, part.color))
+                markers.append(Solid(part.kind, own, part.faces, part.color, number - len(bodies)))
         if self.batch.config.render.overlays:
             markers += [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in simulation.avatars]

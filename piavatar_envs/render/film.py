@@ -10,6 +10,9 @@ import numpy as np
 from piavatar_envs.render.coloring import color_by
 from piavatar_envs.render.scene import Body, Marker, Scene, Solid
 
+#: Begin of the names of bodies.
+_BODY = "body_"
+
 
 @dataclass(eq=False)
 class Moving:
@@ -96,17 +99,19 @@ class Film:
 class Names:
     """Names of meshes in a series of scenes.
 
-    A mesh that has the same place in the scene and the same triangles keeps its name; others are numbered.
+    A mesh that has the same place in the scene and the same triangles keeps its name, a marker one of the same colours
+    as well; others are numbered.
     """
 
     def __init__(self) -> None:
         """Begin without names."""
-        self._known: dict[tuple[str, int, bytes], str] = {}
+        self._known: dict[tuple[str, int, bytes, bytes], str] = {}
 
     def meshes(self, scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
         """Yield name, vertices, triangles and colours (sRGB, uint8) of everything in the next scene."""
         for place, vertices, faces, color in _meshes(scene):
-            key = (place, len(vertices), np.ascontiguousarray(faces).tobytes())
+            fixed = b"" if place.startswith(_BODY) else color.tobytes()
+            key = (place, len(vertices), np.ascontiguousarray(faces).tobytes(), fixed)
             if key not in self._known:
                 others = sum(other[0] == place for other in self._known)
                 self._known[key] = f"{place}_{others}" if others else place
@@ -118,11 +123,13 @@ class Names:
 def _meshes(scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
     """Yield place in the scene, vertices, triangles and colours of everything in it."""
     for index, body in enumerate(scene.bodies):
-        yield f"body_{index}", body.vertices, body.faces, _colors_of(body)
+        yield f"{_BODY}{index}", body.vertices, body.faces, _colors_of(body)
     for index, marker in enumerate(scene.markers):
         vertices, faces = marker.mesh()
-        kind = marker.kind if isinstance(marker, Solid) else type(marker).__name__.lower()
-        yield f"{kind}_{index}", vertices, faces, _colors_of(marker, len(vertices))
+        kind, number = type(marker).__name__.lower(), index
+        if isinstance(marker, Solid):
+            kind, number = marker.kind, marker.number
+        yield f"{kind}_{number}", vertices, faces, _colors_of(marker, len(vertices))
 
 
 def _colors_of(thing: Body | Marker, count: int = 0) -> np.ndarray:

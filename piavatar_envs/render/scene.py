@@ -168,12 +168,14 @@ class Solid:
         vertices: in the world [m], shape ``(V, 3)``.
         faces: triangles, shape ``(T, 3)``.
         color: sRGB in [0, 1].
+        number: its own among those of the scene, which stays when others are hidden.
     """
 
     kind: str
     vertices: np.ndarray
     faces: np.ndarray
     color: Color
+    number: int
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""

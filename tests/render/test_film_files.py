@@ -10,7 +10,7 @@ import pytest
 from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.render.coloring import color_by, linear_to_srgb
 from piavatar_envs.render.film_files import film_writer
-from piavatar_envs.render.scene import Body, Box, Scene, Sphere
+from piavatar_envs.render.scene import Body, Box, Scene, Solid, Sphere
 
 RATE, FRAMES = 25.0, 6
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
@@ -115,6 +115,17 @@ def test_usd_has_points_colours_and_visibility_in_time(tmp_path):
         assert seen == ("inherited" if frame in (2, 4) else "invisible")
     colors = linear_to_srgb(np.array(body.GetDisplayColorAttr().Get(3))) * 255.0
     np.testing.assert_allclose(colors, COLORS, atol=0.3)
+
+
+def test_markers_keep_their_names_when_others_are_hidden(tmp_path):
+    writer = film_writer(tmp_path, "glb", RATE)
+    for shown in ([0, 1], [1], [0, 1]):
+        solids = [Solid("box", shape(3 * i), FACES, ((1, 0, 0), (0, 0, 1))[i], i) for i in shown]
+        writer.add(Scene([], [*solids, Sphere(np.zeros(3), 0.1, (0.0, len(shown) / 2, 0.0))]))
+    gltf = read_gltf(writer.finish()[0])
+    assert gltf.names == ["box_0", "box_1", "sphere_2", "sphere_1"]  # one sphere changes colour and place
+    scaled = {gltf.names[track.node]: track.values[:, 0].tolist() for track in gltf.animations[0].tracks}
+    assert scaled == {"box_0": [1, 0, 1], "sphere_2": [1, 0, 1], "sphere_1": [0, 1, 0]}
 
 
 def test_films_that_cannot_be_written_are_refused(tmp_path, monkeypatch):
