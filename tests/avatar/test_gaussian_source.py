@@ -14,6 +14,8 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.body.sources import check_settings, gaussian, load_asset, source_of
 from piavatar_envs.avatar.body.splat_files import write_ply
 from piavatar_envs.avatar.body.splat_registration import FittedBody
+from piavatar_envs.config import ConfigError, load_config
+from piavatar_envs.tasks import load_task
 from tests.avatar.characters import in_t_pose
 from tests.avatar.splat_clouds import on_body
 
@@ -90,6 +92,20 @@ def test_the_source_is_found_by_the_file(file, tmp_path):
     (tmp_path / "a.gltf").write_text('{"extensionsUsed": ["KHR_gaussian_splatting"]}')
     assert source_of(tmp_path / "a.ply") == source_of("none.ply") == "mesh"
     assert source_of(tmp_path / "a.gltf") == "gaussian" and source_of("none.gltf") == "glb"
+
+
+def test_settings_of_another_body_are_settings(file, body):
+    given = {"pose": "T", "up": "-y", "body": {"source": "embedded", "appearance": "skin"}}
+    found = load_asset("gaussian", file, **given)
+    assert found is load_asset("gaussian", file, **given)
+    np.testing.assert_array_equal(found.vertices, body.vertices)
+    task = load_task("PIAvatar/Reach-v0")
+    settings = {f"avatar.{name}": value for name, value in {"source": "gaussian", "path": file, **given}.items()}
+    config = load_config(task.Config, None, settings)
+    assert config.avatar.settings["body"] == given["body"]
+    for value in ({"source": "a"}, {"other": {"source": "embedded"}}, "embedded"):
+        with pytest.raises(ConfigError, match="body|unknown avatar source 'a'"):
+            load_config(task.Config, None, settings | {"avatar.body": value})
 
 
 @pytest.fixture

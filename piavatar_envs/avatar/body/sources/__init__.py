@@ -116,6 +116,9 @@ def check_settings(source: str, settings: Mapping[str, Any]) -> None:
             wanted = error.errors()[0]["msg"].replace("Input should be", "it must be")
             wanted = wanted.replace("an instance of Sequence", "a list")
             raise ValueError(f"avatar source {source!r} has {name}={settings[name]!r}: {wanted}") from None
+        if isinstance(settings[name], Mapping):  # of another source
+            others = dict(settings[name])
+            check_settings(others.pop("source", "embedded"), others)
 
 
 def load_asset(source: str = "embedded", path: str | Path | None = None, **settings: Any) -> AvatarAsset:
