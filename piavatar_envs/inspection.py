@@ -109,7 +109,7 @@ def draw(asset: AvatarAsset, path: Path) -> None:
         ImportError: the extra of pictures is not installed.
     """
     from piavatar_envs.render.renderer import Renderer
-    from piavatar_envs.render.scene import Body, Camera, Capsule, Sphere
+    from piavatar_envs.render.scene import Body, Camera, Capsule, MovedSplats, Sphere
 
     try:
         from PIL import Image
@@ -119,7 +119,8 @@ def draw(asset: AvatarAsset, path: Path) -> None:
     body = asset.mean_body()
     shift = body.vertices[0].astype(np.float64) - asset.vertices[0]
     look = asset.drawn
-    surface = Body((look.vertices + shift).astype(np.float32), look.faces, colors=look.colors_of(0))
+    splats = None if look.splats is None else MovedSplats.resting(look.splats.cloud, shift)
+    surface = Body((look.vertices + shift).astype(np.float32), look.faces, colors=look.colors_of(0), splats=splats)
     joints = body.joints.astype(np.float64)
     bones = [_bone(joints[PARENTS[joint]], joints[joint], Capsule) for joint in range(1, len(JOINT_NAMES))]
     skeleton = [*bones, *(Sphere(joint, _JOINT) for joint in joints)]
@@ -183,6 +184,9 @@ def _body(asset: AvatarAsset) -> Report:
         "mass": f"{density * volume:.1f} kg at {density:g} kg/m^3",
         "skin": f"{len(asset.vertices)} vertices, {len(asset.faces)} triangles",
     }
+    if asset.look is not None and asset.look.splats is not None:
+        cloud = asset.look.splats.cloud
+        report["splats"] = f"{len(cloud)}, with colours of degree {cloud.degree}"
     if asset.skeleton is not None:
         report["skeleton"] = f"{len(asset.skeleton.points)} points"
     if asset.groups:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from piavatar_envs.avatar.body.sources import check_settings, gaussian, load_ass
 from piavatar_envs.avatar.body.splat_files import write_ply
 from piavatar_envs.avatar.body.splat_registration import FittedBody
 from piavatar_envs.config import ConfigError, load_config
+from piavatar_envs.inspection import examine
 from piavatar_envs.tasks import load_task
 from tests.avatar.characters import in_t_pose
 from tests.avatar.splat_clouds import on_body
@@ -104,8 +106,15 @@ def test_settings_of_another_body_are_settings(file, body):
     config = load_config(task.Config, None, settings)
     assert config.avatar.settings["body"] == given["body"]
     for value in ({"source": "a"}, {"other": {"source": "embedded"}}, "embedded"):
-        with pytest.raises(ConfigError, match="body|unknown avatar source 'a'"):
+        with pytest.raises(ConfigError, match=r"body|unknown avatar source 'a'"):
             load_config(task.Config, None, settings | {"avatar.body": value})
+
+
+def test_a_report_names_the_splats(file, tmp_path):
+    pytest.importorskip("PIL")
+    found = examine(Path(file), {"pose": "T", "up": "-y"}, tmp_path / "a.png")
+    assert found["source"] == "gaussian" and found["splats"] == f"{COUNT}, with colours of degree 1"
+    assert (tmp_path / "a.png").is_file()
 
 
 @pytest.fixture
