@@ -21,7 +21,6 @@ from piavatar_envs.config import BodyColor, RenderConfig
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.pixels import task_camera
 from piavatar_envs.sim.forces import Target
 
 if TYPE_CHECKING:
@@ -178,6 +177,7 @@ class Picture:
 
     def __init__(self, batch: BatchEnv, config: RenderConfig) -> None:
         """Open the renderer."""
+        from piavatar_envs.envs.pixels import task_camera
         from piavatar_envs.render import Renderer
 
         self.config = config
@@ -449,6 +449,7 @@ class Live:
             ValueError: a port out of range.
         """
         if self._view is None:
+            from piavatar_envs.envs.pixels import task_camera
             from piavatar_envs.render.live import LiveView
 
             self._view = LiveView(task_camera(self._batch, self._batch.task), self._port)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -26,7 +26,6 @@ from piavatar_envs.envs.episodes import (
     seeds_as_int32,
 )
 from piavatar_envs.envs.observer import Observer
-from piavatar_envs.envs.pixels import PixelObserver
 from piavatar_envs.envs.state import (
     SETTINGS,
     add_forces,
@@ -40,6 +39,9 @@ from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.checks import check_places
 from piavatar_envs.sim.forces import Target
 from piavatar_envs.sim.world import Simulation
+
+if TYPE_CHECKING:
+    from piavatar_envs.envs.pixels import PixelObserver
 
 
 def check_count(name: str, count: Any, otherwise: str = "") -> None:
@@ -109,7 +111,11 @@ class BatchEnv(EpisodeArrays):
         task.allocate_declared(self)
         task.allocate(self)
         self.observer.connect(self)
-        self.pixels: PixelObserver | None = PixelObserver(self, task) if self.config.observes_pixels else None
+        self.pixels: PixelObserver | None = None
+        if self.config.observes_pixels:
+            from piavatar_envs.envs.pixels import PixelObserver  # the renderer, which other environments do without
+
+            self.pixels = PixelObserver(self, task)
         self.reset_graph = LaunchGraph(self.device, condition=self.begins)
         self.step_graph, self.observe_graph = LaunchGraph(self.device), LaunchGraph(self.device)
         self.count_graph, self.ended_graph = LaunchGraph(self.device), LaunchGraph(self.device)

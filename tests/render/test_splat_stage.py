@@ -111,3 +111,18 @@ def test_agents_of_a_game_have_splats_of_their_own(device, tmp_path):
         c = stage.splats.covariances.numpy()[0, own][:, [0, 3, 5]]
         found = np.diagonal(read.covariances(), axis1=1, axis2=2)
         np.testing.assert_allclose(found, c, atol=1e-3 * c.max())
+
+
+def test_splats_are_observed_as_pixels(make_batch, equal):
+    settings = {"obs_mode": "pixels", "segmentation": True, "pixels": {"width": 24, "height": 24}, **SPLATS}
+    batch, alone = make_batch("PIAvatar/Reach-v0", 3, **settings), make_batch("PIAvatar/Reach-v0", **settings)
+    batch.reset(seeds=[7, 8, 9])
+    alone.reset(seeds=[8])
+    act(batch, 2)
+    act(alone, 2, rows=slice(1, 2))
+    shown = {name: own[0].numpy().copy() for name, own in batch.pixels.arrays.items()}
+    assert all(equal(own[0].numpy()[0], shown[name][1]) for name, own in alone.pixels.arrays.items())
+    assert (shown["segmentation"] == 1).sum() > 60, "the avatar is seen"
+    batch.reset(np.array([True, False, False]))
+    now = batch.pixels.arrays["pixels"][0].numpy()
+    assert equal(now[1:], shown["pixels"][1:]) and not equal(now[0], shown["pixels"][0])
