@@ -17,15 +17,17 @@ import numpy as np
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, body_part_of_joint
 from piavatar_envs.avatar.skinning import unpack
-from piavatar_envs.config import BodyColor, RenderConfig
+from piavatar_envs.config import BodyColor, PixelsConfig, RenderConfig
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.forces import Target
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+    from piavatar_envs.envs.pixels import PixelObserver
     from piavatar_envs.render import Arrow, Marker, MovedSplats, Scene
     from piavatar_envs.render.live import Drag, LiveView
     from piavatar_envs.render.stage import Stage
@@ -212,6 +214,7 @@ class Pictures:
         self._place, self._config = place, config
         self._opened: dict[int, Picture] = {}
         self._progress: dict[int, Progress] = {}
+        self._observers: dict[int, tuple[LaunchGraph, PixelObserver]] = {}  # by batch
 
     def frame(self, env: int) -> np.ndarray:
         """Draw the scene of environment ``env``, ``(height, width, 3)`` uint8.
@@ -230,10 +233,15 @@ class Pictures:
     def mosaic(self, count: int) -> np.ndarray:
         """Draw the first ``count`` environments side by side, in rows as near to a square as can be; the rest is black.
 
+        They are drawn together on their device, by cameras that do not glide, unless the settings ask for what only
+        the host draws.
+
         Raises:
             ImportError: the extra ``render`` is not installed.
         """
-        frames = np.stack([self.frame(env) for env in range(count)])
+        task = self._place(0)[0].task
+        plain = self._config.color == "skin" and self._config.overlays and type(task).markers is Task.markers
+        frames = np.stack(self._together(count) if plain else [self.frame(env) for env in range(count)])
         columns = math.ceil(math.sqrt(count))
         rows = math.ceil(count / columns)
         height, width = frames.shape[1:3]
@@ -242,11 +250,30 @@ class Pictures:
         grid = tiles.reshape(rows, columns, height, width, 3).swapaxes(1, 2)
         return grid.reshape(rows * height, columns * width, 3)
 
+    def _together(self, count: int) -> list[np.ndarray]:
+        """Draw the first ``count`` environments, all of a batch at once."""
+        from piavatar_envs.envs.pixels import PixelObserver
+
+        frames: list[np.ndarray] = []
+        while len(frames) < count:
+            batch, _ = self._place(len(frames))
+            if id(batch) not in self._observers:
+                size = PixelsConfig.model_construct(width=self._config.width, height=self._config.height)
+                shown = min(batch.num_envs, count - len(frames))
+                graph, observer = LaunchGraph(batch.device), PixelObserver(batch, batch.task, size, shown)
+                observer.record(graph)
+                self._observers[id(batch)] = graph, observer
+            graph, observer = self._observers[id(batch)]
+            graph.run()
+            frames += list(observer.arrays["pixels"][0].numpy())
+        return frames
+
     def close(self) -> None:
         """Close all renderers."""
         for picture in self._opened.values():
             picture.close()
         self._opened.clear()
+        self._observers.clear()
 
 
 class Pace:

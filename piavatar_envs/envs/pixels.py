@@ -31,23 +31,31 @@ class PixelObserver:
             Agents that see through the same camera share them.
     """
 
-    def __init__(self, env: EpisodeArrays, task: Task) -> None:
+    def __init__(
+        self, env: EpisodeArrays, task: Task, settings: PixelsConfig | None = None, count: int | None = None
+    ) -> None:
         """Build the surfaces, and allocate the pictures.
+
+        Args:
+            env: the environments.
+            task: of theirs.
+            settings: of the pictures; the task's if not given.
+            count: number of environments that are shown, the first ones; all if not given.
 
         Raises:
             ConfigError: the task has markers that only the host can draw.
         """
         task.check_pixels()
         self._env, self._task = env, task
-        settings, simulation, device = task.config.pixels, env.simulation, env.device
-        self.stage = Stage(simulation, task.marker_specs())
+        settings, device, count = settings or task.config.pixels, env.device, count or env.num_envs
+        self.stage = Stage(env.simulation, task.marker_specs(), range(count))
         of_each_agent = settings.camera.kind not in ("task", "placed")
         size = settings.height, settings.width
         self._eyes: list[tuple[BatchCamera, Painter]] = []
         for agent in range(env.num_agents if of_each_agent else 1):
             painter = Painter(
                 self.stage.surfaces,
-                env.num_envs,
+                count,
                 *size,
                 device,
                 depth=settings.depth,
@@ -57,8 +65,8 @@ class PixelObserver:
             painter.layers += self.stage.layers(*size)
             out = painter.views, painter.centers
             self._eyes.append((_camera_of(settings, task, env, self.stage, agent, out), painter))
-        self._all = wp.full(env.num_envs, True, dtype=wp.bool, device=device)
-        shape = (env.num_envs, *size, 1)
+        self._all = wp.full(count, True, dtype=wp.bool, device=device)
+        shape = (count, *size, 1)
         self._farthest, painters = settings.farthest, [painter for _, painter in self._eyes]
         views = {"pixels": [painter.picture for painter in painters]}
         if settings.depth:
