@@ -127,6 +127,36 @@ def crowd(mesh: Path) -> Act:
     )
 
 
+def belly_balls(masses: tuple[float, ...] = (0.5, 2.0, 8.0)) -> list[Act]:
+    """Return acts of balls of several masses thrown at the belly of a soft avatar at 5 m/s."""
+    return [
+        Act(
+            f"ball of {mass:g} kg at the belly",
+            seconds=1.2,
+            scene=SceneConfig(
+                props=(ball(mass, (0.0, BELLY[1] - BALL_RADIUS - 0.25, BELLY[2]), (0.0, 5.0, 0.0), 1e5),)
+            ),
+            physics={"young_modulus": 2e4},
+            control={"tone": 0.1},
+            view=View((3.6, -2.1, 1.3), (0.0, -0.15, 0.85), (0.0, 0.1, 0.2, 0.4)),
+            tags={"ball_kg": mass},
+        )
+        for mass in masses
+    ]
+
+
+def blow() -> Act:
+    """Return an act of a heavy ball against a soft belly, in short control steps, coloured by distortion."""
+    return Act(
+        "blow to the belly",
+        seconds=0.15,
+        scene=SceneConfig(props=(ball(4.0, (0.0, BELLY[1] - BALL_RADIUS - 0.03, BELLY[2]), (0.0, 5.0, 0.0), 1e5),)),
+        physics={"young_modulus": 2e4, "control_dt": 1.0 / 240.0},
+        control={"tone": 0.1},
+        view=View((2.4, -1.9, 1.4), (0.0, -0.05, 1.12), (0.0125, 0.025, 0.0375, 0.05, 0.075, 0.1), color="distortion"),
+    )
+
+
 def belly_dents() -> list[Act]:
     """Return acts of a heavy ball pushed into a limp avatar's belly, with and without shape preservation."""
     thrown = ball(5.0, (0.0, BELLY[1] - BALL_RADIUS - 0.1, BELLY[2]), (0.0, 3.0, 0.0))
@@ -139,7 +169,7 @@ def belly_dents() -> list[Act]:
                 scene=SceneConfig(props=(thrown,)),
                 physics={"soft_young_modulus": 2e4},
                 control={"tone": 0.0, "alpha": alpha, "shape_preservation": kind},
-                view=View((1.7, -1.0, 1.25), (0.0, -0.15, 1.05), (0.1, 0.3, 1.3), color="strain"),
+                view=View((2.6, -1.7, 1.4), (0.0, 0.1, 1.05), (0.1, 0.3, 1.3), color="strain"),
                 tags={"alpha": alpha, "shape_preservation": kind},
             )
         )
@@ -236,7 +266,9 @@ def _modulus(regions: tuple[RegionConfig, ...]) -> float | None:
 def drops() -> list[Act]:
     """Return acts of a body that is set down from 0.3 m within 0.25 s: firm flesh, and soft flesh that lags."""
     down, up = {"root": (0.0, 0.0, 0.0)}, {"root": (0.0, 0.0, 0.3)}
-    return _landings("drop", keyed((0.0, down), (0.6, up), (0.75, up), (1.0, down)), 1.8, "scripted drop of 0.3 m")
+    view = View((3.7, -1.9, 1.35), (0.0, 0.1, 1.05), (0.75, 0.8667, 1.0, 1.1667), color="strain")
+    script = keyed((0.0, down), (0.6, up), (0.75, up), (1.0, down))
+    return _landings("drop", script, 1.8, "scripted drop of 0.3 m", view)
 
 
 def jumps() -> list[Act]:
@@ -244,10 +276,12 @@ def jumps() -> list[Act]:
     if JUMP_CLIP not in list_motions():
         return []
     motion = load_motion(JUMP_CLIP)
-    return _landings("jump", played(motion.translated([*-motion.root_position[0, :2], 0.0])), 1.75, JUMP_CLIP)
+    script = played(motion.translated([*-motion.root_position[0, :2], 0.0]))
+    view = View((4.6, -1.9, 1.1), (0.0, -0.55, 0.92), (0.0, 0.9667, 1.3333), color="strain")
+    return _landings("jump", script, 1.75, JUMP_CLIP, view)
 
 
-def _landings(title: str, script: Script, seconds: float, clip: str) -> list[Act]:
+def _landings(title: str, script: Script, seconds: float, clip: str, view: View) -> list[Act]:
     found = []
     for name, soft, young in (
         ("firm flesh", 0.0, None),
@@ -263,9 +297,7 @@ def _landings(title: str, script: Script, seconds: float, clip: str) -> list[Act
                 physics={"soft_young_modulus": young},
                 control={"soft_tissue": soft},
                 domain=Domain().including((0.0, -2.8, 0.0)),
-                view=View(
-                    eye=(4.6, -1.9, 1.1), target=(0.0, -0.55, 0.92), moments=(0.0, 0.9667, 1.3333), color="strain"
-                ),
+                view=view,
                 tags={"clip": clip, "soft_tissue": soft, "soft_young_modulus_pa": young},
             )
         )

@@ -178,13 +178,18 @@ def can(course: Course) -> Row:
     return row | {"particles_of_the_region": int(simulation.flesh[0].in_region(regions[0]).sum()) if regions else 0}
 
 
-def jump(course: Course) -> Row:
-    """Measure the motion of the belly's soft flesh relative to its bones, from the landing on."""
+def belly_flesh(course: Course) -> np.ndarray:
+    """Return a mask ``(P,)`` of the soft flesh of the belly."""
     flesh = course.stage.simulation.flesh[0]
     points, sampled = flesh.points, flesh.sampled
     rest, low, high = points.rest[0], *(course.stage.simulation.asset.joints[[0, 6], 2])
     soft = softness(rest, sampled.bone, sampled.skin_joints, sampled.skin_weights)
-    belly = (soft > JIGGLING) & (rest[:, 1] < 0.0) & (rest[:, 2] > low) & (rest[:, 2] < high)
+    return (soft > JIGGLING) & (rest[:, 1] < 0.0) & (rest[:, 2] > low) & (rest[:, 2] < high)
+
+
+def jump(course: Course) -> Row:
+    """Measure the motion of the belly's soft flesh relative to its bones, from the landing on."""
+    belly, sampled = belly_flesh(course), course.stage.simulation.flesh[0].sampled
     moved = 1e3 * course.displacements(belly)
     amplitude = np.sqrt((moved**2).mean(1))
     flight = int(course.joints[:, 0, 2].argmax())  # the landing is after the top

@@ -75,7 +75,7 @@ class View:
     Attributes:
         eye, target: the camera and what it looks at [m].
         moments: times of the pictures [s].
-        color: of the body: its ``"skin"`` or its ``"strain"``.
+        color: of the bodies, as ``render.color``.
     """
 
     eye: tuple[float, float, float] = (1.9, -3.1, 1.5)
@@ -178,6 +178,7 @@ class Course:
         stage: the world at the end.
         time: [s], shape ``(T,)``.
         x: particles [m], shape ``(T, P, 3)``.
+        F: their deformation gradients, by component, shape ``(T, 9, P)``.
         local, goal: tracked and commanded joint rotations, ``xyzw``, shape ``(T, 22, 4)``.
         bones, joints: tracked world rotations ``(T, 22, 4)`` and joint positions ``(T, 22, 3)`` [m].
         place, speed: of the props, shape ``(T, B, 3)`` [m], [m/s].
@@ -190,6 +191,7 @@ class Course:
     stage: Stage
     time: np.ndarray
     x: np.ndarray
+    F: np.ndarray
     local: np.ndarray
     goal: np.ndarray
     bones: np.ndarray
@@ -272,6 +274,7 @@ def _look(stage: Stage) -> dict[str, np.ndarray]:
     avatar, props, sensors = simulation.avatar, simulation.props.state, simulation.sensors
     arrays = {
         "x": simulation.state.x,
+        "F": simulation.state.F,
         "local": avatar.tracked.local,
         "goal": avatar.state.goal_rotation,
         "bones": avatar.tracked.rotation,

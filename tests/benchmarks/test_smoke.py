@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from agents import files
 from benchmarks import runner
-from benchmarks.paper import disturbance, supplement, supplement_figures, tracking
+from benchmarks.paper import disturbance, figures, supplement, tracking
 from benchmarks.paper.stage import Act, keyed, perform
 from benchmarks.physics import blows, contact, elastodynamics, stability, torque, wear
 from benchmarks.physics.limbs import Options
@@ -270,11 +270,14 @@ def test_every_study_of_the_supplement_is_judged(tmp_path, device):
 
 def test_a_figure_of_the_supplement_is_drawn(tmp_path):
     pytest.importorskip("PIL", reason="needs the extra render")
-    options = supplement_figures.Options(folder=tmp_path, only=("several_objects",), fidelity="tiny", still=True)
-    (path,) = supplement_figures.main(options)
+    options = figures.Options(folder=tmp_path, only=("propagation",), fidelity="tiny", still=True)
+    (path,) = figures.main(options)
     assert path.stat().st_size > 5_000
+    (act,) = json.loads(path.with_suffix(".json").read_text())["acts"]
+    near, far = act["distortion_0_to_10_cm"], act["distortion_30_to_40_cm"]
+    assert len(act["time_s"]) == len(near) == 37 and max(near) > 2.0 * max(far)
     with pytest.raises(ValueError, match="limb_fields"):
-        supplement_figures.main(replace(options, only=("legs",)))
+        figures.main(replace(options, only=("legs",)))
 
 
 def test_every_environment_is_scored(monkeypatch):
