@@ -17,6 +17,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Height of the bodies that tasks place their cameras for, at most [m].
 SHOWN_HEIGHT = 1.8
+#: Memory of a pixel: its bytes, colour and inverse depth; and of its depth, as drawn and as observed [bytes].
+BYTES_OF_PIXEL, BYTES_OF_DEPTH = 3 + 12 + 4, 4 + 4
 
 
 class PixelObserver:
@@ -44,12 +46,14 @@ class PixelObserver:
 
         Raises:
             ConfigError: the task has markers that only the host can draw.
+            ValueError: the pictures do not fit into the memory of a GPU.
         """
         task.check_pixels()
         self._env, self._task = env, task
         settings, device, count = settings or task.config.pixels, env.device, count or env.num_envs
         self.stage = Stage(env.simulation, task.marker_specs(), range(count))
         of_each_agent = settings.camera.kind not in ("task", "placed")
+        check_memory(count, env.num_agents if of_each_agent else 1, settings, device)
         size = settings.height, settings.width
         self._eyes: list[tuple[BatchCamera, Painter]] = []
         for agent in range(env.num_agents if of_each_agent else 1):
@@ -94,6 +98,32 @@ class PixelObserver:
             painter.record(graph)
         for (_, painter), depth in zip(self._eyes, self._views.get("depth", ()), strict=False):
             graph.launch(cut_depth, depth.shape[:3], [painter.depth, self._farthest], [depth])
+
+
+def check_memory(num_envs: int, num_cameras: int, settings: PixelsConfig, device: str) -> None:
+    """Check that the pictures of a batch fit into memory; beside them there are surfaces, which take less.
+
+    Args:
+        num_envs: number of environments.
+        num_cameras: of each environment.
+        settings: of the pictures.
+        device: Warp device.
+
+    Raises:
+        ValueError: they exceed the free memory of a CUDA device.
+    """
+    target = wp.get_device(device)
+    if not target.is_cuda:
+        return
+    pixel = BYTES_OF_PIXEL + BYTES_OF_DEPTH * settings.depth + settings.segmentation
+    need = num_envs * num_cameras * settings.width * settings.height * pixel
+    if need > target.free_memory:
+        fits = int(num_envs * target.free_memory / need)
+        raise ValueError(
+            f"pictures of {settings.width} x {settings.height} pixels of {num_envs} environments need "
+            f"{need / 2**30:.1f} GiB, {target} has {target.free_memory / 2**30:.1f} GiB free; use num_envs <= {fits}, "
+            "or less of pixels.width and pixels.height"
+        )
 
 
 def _camera_of(

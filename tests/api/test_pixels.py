@@ -10,6 +10,7 @@ from gymnasium.wrappers import FlattenObservation, FrameStackObservation, Graysc
 from gymnasium.wrappers import vector as vector_wrappers
 
 from piavatar_envs.api.conformance import check_task
+from piavatar_envs.config import PixelsConfig
 from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks import task_modules
 
@@ -246,3 +247,19 @@ def test_a_picture_renders_as_an_observation_too(make_env):
     pytest.importorskip("PIL", reason="needs the extra render")
     env = gymnasium.wrappers.AddRenderObservation(make_env(REACH, render_mode="rgb_array", width=32, height=24))
     assert env.observation_space.contains(env.reset(seed=0)[0])
+
+
+def test_pictures_that_do_not_fit_are_refused(monkeypatch):
+    from piavatar_envs.envs import pixels
+
+    class Small:
+        is_cuda, free_memory = True, 2**30
+
+        def __str__(self) -> str:
+            return "cuda:0"
+
+    monkeypatch.setattr(pixels.wp, "get_device", lambda _: Small())
+    settings = PixelsConfig(width=1024, height=1024, depth=True)
+    pixels.check_memory(32, 1, settings, "cuda:0")
+    with pytest.raises(ValueError, match=r"1024 x 1024 pixels of 64 environments need 1\.7 GiB.* num_envs <= 37, or"):
+        pixels.check_memory(64, 1, settings, "cuda:0")
