@@ -12,7 +12,9 @@ from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ControlConfig, PoseControlConfig
 from piavatar_envs.config.schema import Place
 from piavatar_envs.core.rng import STREAM_BALL
-from piavatar_envs.envs.episodes import Bones, Episodes, Props, random_of
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
+from piavatar_envs.envs.task import Metric, Term
+from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.common.ball_goal import (
     FEET_TERMS,
     GATE_TERMS,
@@ -22,7 +24,7 @@ from piavatar_envs.tasks.common.ball_goal import (
     observe_feet,
     turn_and_weigh,
 )
-from piavatar_envs.tasks.common.ranges import DistanceRange, MassRange
+from piavatar_envs.tasks.common.ranges import DistanceRange, MassRange, Weight
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,13 +33,17 @@ LEGS = ("hip", "knee", "ankle")
 KICKING = (*(f"{side}_{joint}" for joint in LEGS for side in ("left", "right")), "spine1", "spine2", "spine3")
 
 _LEFT_FOOT, _RIGHT_FOOT = wp.constant(joint_index("left_foot")), wp.constant(joint_index("right_foot"))
+_LEFT_ANKLE, _RIGHT_ANKLE = wp.constant(joint_index("left_ankle")), wp.constant(joint_index("right_ankle"))
+#: Height of the standing foot above its place at rest without a cost, and the further height at the full cost [m].
+STANCE_BOUND, STANCE_MARGIN = wp.constant(0.02), wp.constant(0.1)
 
 
 class KickBallConfig(GateConfig):
     """Settings of KickBall."""
 
     control: ControlConfig = Field(
-        default_factory=lambda: PoseControlConfig(joint_speed_limit=7.0), description="how actions move the body"
+        default_factory=lambda: PoseControlConfig(joint_speed_limit=7.0, bound_motion=True),
+        description="how actions move the body",
     )
     episode_seconds: float = Field(3.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     joints: tuple[str, ...] | None = Field(KICKING, description="joints that act; null for all 21")
@@ -47,6 +53,7 @@ class KickBallConfig(GateConfig):
     target_angle: float = Field(0.35, ge=0.0, le=1.0, description="its greatest angle from straight ahead [rad]")
     target_height: float = Field(0.25, ge=0.0, le=2.0, description="height of the gate's centre [m]")
     target_radius: float = Field(0.4, gt=0.0, le=1.0, description="radius of the gate's opening [m]")
+    stance_cost: Weight = Field(0.01, description="weight of the height of the standing foot [-]")
 
 
 @wp.kernel
@@ -81,12 +88,45 @@ def find_feet(
     gap[e] = wp.min(left, right) - ball_radius
 
 
+@wp.func
+def lift_of(bones: Bones, e: int, ankle: int, foot: int):
+    """Return how far the higher of ankle and ball of a foot is above its height at rest [m]."""
+    rest = row(e, bones.body.rest_joint.shape[0])
+    heel = bones.position[e, ankle][2] - bones.body.rest_joint[rest, ankle][2]
+    ball = bones.position[e, foot][2] - bones.body.rest_joint[rest, foot][2]
+    return wp.max(heel, ball)
+
+
+@wp.kernel
+def judge_stance(
+    bones: Bones,
+    stance_cost: float,
+    # out
+    outcome: Outcome,
+):
+    """Take off reward while neither foot is on the ground; write the height of the lower one."""
+    e = wp.tid()
+    lift = wp.min(lift_of(bones, e, _LEFT_ANKLE, _LEFT_FOOT), lift_of(bones, e, _RIGHT_ANKLE, _RIGHT_FOOT))
+    share = wp.clamp((lift - STANCE_BOUND) / STANCE_MARGIN, 0.0, 1.0)
+    outcome.terms[e, 0, KickBallTask.rewards.stance] = -stance_cost * share
+    outcome.metrics[e, 0, KickBallTask.metrics.lift] = lift
+
+
 class KickBallTask(GateTask):
     """Kick the ball through the gate."""
 
     Config = KickBallConfig
     description = "kick a soft ball through a gate on the ground"
     observation_terms = (*GATE_TERMS, *FEET_TERMS)
+    rewards = (
+        *GateTask.rewards,
+        Term(
+            "stance",
+            f"minus `stance_cost` times the height of the lower foot above its height at rest, beyond "
+            f"{float(STANCE_BOUND):g} m and over {float(STANCE_MARGIN):g} m, at most 1: one foot stays on the ground",
+        ),
+    )
+    metrics = (*GateTask.metrics, Metric("lift", "m", "height of the lower foot above its height at rest"))
 
     camera_direction = (-3.0, 2.4, 1.0)
 
@@ -98,8 +138,8 @@ its root held in place, and has one shot: its legs and spine act (`joints`), fas
 or with an oblique swing when the gate is to the side, and hits heavy balls harder. A ball that has missed rolls on
 until time is up.
 
-The shaping terms pay only for improvements on the best of the episode, so all terms but the control cost add up to
-at most 1, half of it for the goal."""
+The shaping terms pay only for improvements on the best of the episode, so all terms but the costs of control and
+stance add up to at most 1, half of it for the goal."""
     picture_seconds = 0.17
     picture_actions: ClassVar[Mapping[str, float]] = {"right_hip.x": -0.8, "right_ankle.x": 0.2}
 
@@ -115,6 +155,10 @@ at most 1, half of it for the goal."""
     def record_gap(self, env, graph) -> None:
         inputs = [env.bones[0], self.ball_column(env, "position"), self.config.ball_radius]
         graph.launch(find_feet, env.num_envs, inputs, [self.gap])
+
+    def record_outcome(self, env, graph) -> None:
+        super().record_outcome(env, graph)
+        graph.launch(judge_stance, env.num_envs, [env.bones[0], self.config.stance_cost], [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         start = self.record_gate_terms(env, graph, agent, start)

@@ -65,7 +65,10 @@ def test_a_training_resumes_with_its_weights_and_is_scored_by_motion(device, tmp
     """Bit for bit; ``step`` is held out, and the trained policy plays it."""
     config = {
         "env_id": TRACK, "num_envs": 4, "iterations": 4, "checkpoint_every": 1, "evaluation": {"episodes": 6},
-        "env": {**SETTINGS, "motion": ["idle", "kick", "squat", "step"], "split": "train", "held_out_share": 0.45},
+        "env": {
+            **SETTINGS, "fail_distance": 0.2, "motion": ["idle", "kick", "squat", "step"], "split": "train",
+            "held_out_share": 0.45,
+        },
         "ppo": {"rollout_steps": 8, "minibatches": 1, "epochs": 1}, "motions": {"by": "failures", "memory": 2},
     }  # fmt: skip
     path = tmp_path / "track.yaml"

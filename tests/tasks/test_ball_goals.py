@@ -288,7 +288,9 @@ def test_rewards_metrics_and_observations_are_those_of_numpy(make_env, task):
         parts = feet if task == KICK else {"head": middle(env, "head")}
         reach = env.config.ball_radius + (0.0 if task == KICK else float(HEAD_RADIUS))
         expected = shot.step(x, v, min(np.linalg.norm(part - x) for part in parts.values()) - reach, action)
-        assert list(reward_terms(info).values()) == pytest.approx(expected, abs=2e-4), step
+        terms = reward_terms(info)
+        terms.pop("stance", None)  # see the next test
+        assert list(terms.values()) == pytest.approx(expected, abs=2e-4), step
         assert not info["success"]
         assert info["ball_speed"] == pytest.approx(np.linalg.norm(v), abs=1e-4)
         assert info["distance_to_target"] == pytest.approx(np.linalg.norm(center - x), abs=1e-4)
@@ -300,6 +302,29 @@ def test_rewards_metrics_and_observations_are_those_of_numpy(make_env, task):
         assert seen(env, observation, "progress") == pytest.approx(shot.best, abs=1e-3)
         earned.append(expected)
     assert np.sum(earned, axis=0)[1 if task == KICK else 0] > (0.1 if task == KICK else 0.05)
+
+
+def test_kicks_cost_while_neither_foot_is_on_the_ground(make_env):
+    env = make_env(KICK, pose_noise=0.0)
+    hips = [index for index, name in enumerate(env.action_names) if name in ("left_hip.x", "right_hip.x")]
+    for both in (False, True):
+        env.reset(seed=0)
+        rest = [
+            joints(env)[joint_index(f"{side}_{bone}")][2] for side in ("left", "right") for bone in ("ankle", "foot")
+        ]
+        action = np.zeros(env.action_space.shape, np.float32)
+        action[hips if both else hips[:1]] = -1.0  # swings the leg forwards
+        for _ in range(6):
+            *_, info = env.step(action)
+        now = [
+            joints(env)[joint_index(f"{side}_{bone}")][2] for side in ("left", "right") for bone in ("ankle", "foot")
+        ]
+        rise = np.subtract(now, rest).reshape(2, 2).max(axis=1)
+        lift = rise.min()
+        assert rise.max() > 0.1
+        assert (lift > 0.1) == both
+        assert info["lift"] == pytest.approx(lift, abs=1e-3)
+        assert info["reward_stance"] == pytest.approx(-0.01 * np.clip((lift - 0.02) / 0.1, 0.0, 1.0), abs=1e-4)
 
 
 def test_a_ball_at_rest_waits_for_the_kick(make_batch):
