@@ -71,7 +71,7 @@ def test_elements_before_the_vertices_are_skipped(cloud, tmp_path):
     assert_equal(read_splats(tmp_path / "a.ply"), cloud, 2e-6)
 
 
-def gltf_of(cloud: SplatCloud, path, **change):
+def gltf_of(cloud: SplatCloud, path, space: str = "srgb_rec709_display", **change):
     """Write a cloud in glTF's axes."""
     turned = cloud.placed(Y_UP, 1.0, np.zeros(3))
     out = Writer()
@@ -84,7 +84,7 @@ def gltf_of(cloud: SplatCloud, path, **change):
         name if name == "POSITION" else f"KHR_gaussian_splatting:{name}": out.accessor(array, kinds[array.shape[1]])
         for name, array in names.items()
     }
-    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension = {"kernel": "ellipse", "colorSpace": space}
     primitive = {"mode": 0, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": extension}}
     out.add("meshes", {"primitives": [primitive | change]})
     out.document["nodes"] = [{"mesh": 0, "scale": [2.0, 2.0, 2.0], "translation": [0.0, 1.0, 0.0]}]
@@ -97,6 +97,8 @@ def test_gltf(cloud, tmp_path):
     assert_equal(read, cloud.placed(np.eye(3), 2.0, np.array([0.0, 0.0, 1.0])), 1e-5)
     with pytest.raises(ValueError, match="kernel"):
         read_splats(gltf_of(cloud, tmp_path / "b.glb", mode=4))
+    with pytest.raises(ValueError, match=r"linear \(lin_rec709_display\)"):
+        read_splats(gltf_of(cloud, tmp_path / "b.glb", "lin_rec709_display"))
 
 
 def test_colours_turn_with_their_splats(cloud):

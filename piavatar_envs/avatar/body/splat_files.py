@@ -380,11 +380,12 @@ def _count(gltf: Gltf, primitive: dict[str, Any]) -> Any:
 def _primitive(gltf: Gltf, primitive: dict[str, Any]) -> SplatCloud:
     """Return the splats of a primitive, in the space of its mesh."""
     attributes, count = primitive["attributes"], _count(gltf, primitive)
-    kernel = primitive["extensions"][_EXTENSION].get("kernel", "ellipse")
-    if primitive.get("mode", 4) != 0 or kernel != "ellipse":
-        raise ValueError(
-            f"its splats are of mode {primitive.get('mode', 4)} and kernel {kernel!r:.40}, not 0 and ellipse"
-        )
+    extension, mode = primitive["extensions"][_EXTENSION], primitive.get("mode", 4)
+    kernel, space = (str(extension.get(name, other)) for name, other in (("kernel", "ellipse"), ("colorSpace", "")))
+    if mode != 0 or kernel != "ellipse":
+        raise ValueError(f"its splats are of mode {mode!r:.20} and kernel {kernel:.40}, not 0 and ellipse")
+    if space.startswith("lin"):
+        raise ValueError(f"its colours are linear ({space:.40}); export them as srgb_rec709_display")
 
     def values(name: str, width: int) -> np.ndarray:
         if name not in attributes:
