@@ -18,6 +18,9 @@ JUMP_CLIP = "deepmimic:jump"
 FACE = (0.0, -0.13, 1.53)  # a point of the standing body's skin [m]
 BELLY = (0.0, -0.13, 1.03)
 CHEST = (0.0, -0.14, 1.25)
+SHORT = 1.0 / 120.0  # [s], a control step in which a hit is resolved
+USUAL_ALPHA = 0.3 * 30.0 * SHORT  # the rate of shape preservation of usual control steps
+SOFT = 2e4  # [Pa], of the softest flesh of the trunk
 
 SIDE = View(eye=(3.3, -1.7, 1.1), target=(0.0, -0.35, 0.75), moments=(0.5,))
 FRONT = View(eye=(1.6, -3.4, 1.5), target=(0.0, -0.1, 0.85), moments=(0.3,))
@@ -69,6 +72,65 @@ def kicks(masses: tuple[float, ...] = (0.5, 1.5, 8.0)) -> list[Act]:
     return found
 
 
+def belly_balls(masses: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0, 8.0)) -> list[Act]:
+    """Return acts of balls of one size, stiffness and speed (3 m/s), light to heavy, against a soft belly."""
+    return [
+        Act(
+            f"ball of {mass:g} kg at the belly",
+            seconds=0.2,
+            scene=SceneConfig(props=(_at_belly(mass),)),
+            physics={"soft_young_modulus": SOFT, "control_dt": SHORT},
+            control={"alpha": USUAL_ALPHA},
+            view=View((1.5, -0.75, 1.25), (0.0, -0.22, 1.05), (0.05,), ("skin", "strain")),
+            tags={"ball_kg": mass},
+        )
+        for mass in masses
+    ]
+
+
+def _at_belly(mass: float, gap: float = 0.05) -> PropConfig:
+    """Return a ball that flies at 3 m/s towards the belly, ``gap`` [m] before it."""
+    return ball(mass, (0.0, BELLY[1] - BALL_RADIUS - gap, BELLY[2]), (0.0, 3.0, 0.0), 1e5)
+
+
+def remedies() -> list[Act]:
+    """Return acts of a ball of 2 kg at a soft belly: as usual, and with one remedy of sticky contact taken away."""
+    usual, bare = _at_belly(2.0, gap=0.1), []
+    for name, scene, physics in (
+        ("as usual", {}, {}),
+        ("normals of each body", {"contact_normals": "own"}, {}),
+        ("contact at 1.5 spacings", {"contact_gate": 1.5}, {}),
+        ("no stress", {}, {"decoupling": "no_stress"}),
+    ):
+        bare.append(
+            Act(
+                f"ball of 2 kg at the belly, {name}",
+                seconds=0.5,
+                scene=SceneConfig(props=(usual,), **scene),
+                physics={"soft_young_modulus": SOFT, "control_dt": SHORT, **physics},
+                control={"alpha": USUAL_ALPHA},
+                view=View((1.5, -0.75, 1.25), (0.0, -0.22, 1.02), (0.0583, 0.2667)),
+                tags={"variant": name},
+            )
+        )
+    return bare
+
+
+def blow() -> Act:
+    """Return an act of a ball that strikes the belly of a floating, limp body, in steps short beside a wave's way."""
+    scene = SceneConfig(
+        props=(ball(8.0, (0.0, BELLY[1] - BALL_RADIUS - 0.01, BELLY[2]), (0.0, 8.0, 0.0), 1e5),), ground=False
+    )
+    return Act(
+        "blow to the belly",
+        seconds=0.12,
+        scene=scene,
+        physics={"control_dt": 1.0 / 300.0, "gravity": 0.0},
+        control={"tone": 0.0, "alpha": 0.0, "root": "free"},
+        view=View((2.6, -2.6, 1.2), (0.0, 0.0, 0.9), (0.01, 0.02, 0.04, 0.08), colors=("distortion",)),
+    )
+
+
 def throws(moduli: tuple[float, ...] = (1e3, 1e4, 1e5, 1e6, 1e7)) -> list[Act]:
     """Return acts of a ball of 1.5 kg thrown at the chest at 4 m/s, from soft to stiff."""
     start = (0.0, CHEST[1] - BALL_RADIUS - 0.25, CHEST[2])
@@ -94,7 +156,7 @@ def head_hits(tones: tuple[float, ...] = (1.0, 0.3, 0.0)) -> list[Act]:
             seconds=1.5,
             scene=SceneConfig(props=(thrown,)),
             control={"tone": tone},
-            view=View(eye=(3.3, -1.9, 1.35), target=(0.0, -0.1, 0.85), moments=(0.1667, 0.4, 1.5)),
+            view=View(eye=(3.3, -1.9, 1.35), target=(0.0, -0.1, 0.85), moments=(0.1, 0.1667, 0.4)),
             tags={"tone": tone},
         )
         for tone in tones
@@ -127,36 +189,6 @@ def crowd(mesh: Path) -> Act:
     )
 
 
-def belly_balls(masses: tuple[float, ...] = (0.5, 2.0, 8.0)) -> list[Act]:
-    """Return acts of balls of several masses thrown at the belly of a soft avatar at 5 m/s."""
-    return [
-        Act(
-            f"ball of {mass:g} kg at the belly",
-            seconds=1.2,
-            scene=SceneConfig(
-                props=(ball(mass, (0.0, BELLY[1] - BALL_RADIUS - 0.25, BELLY[2]), (0.0, 5.0, 0.0), 1e5),)
-            ),
-            physics={"young_modulus": 2e4},
-            control={"tone": 0.1},
-            view=View((3.6, -2.1, 1.3), (0.0, -0.15, 0.85), (0.0, 0.1, 0.2, 0.4)),
-            tags={"ball_kg": mass},
-        )
-        for mass in masses
-    ]
-
-
-def blow() -> Act:
-    """Return an act of a heavy ball against a soft belly, in short control steps, coloured by distortion."""
-    return Act(
-        "blow to the belly",
-        seconds=0.15,
-        scene=SceneConfig(props=(ball(4.0, (0.0, BELLY[1] - BALL_RADIUS - 0.03, BELLY[2]), (0.0, 5.0, 0.0), 1e5),)),
-        physics={"young_modulus": 2e4, "control_dt": 1.0 / 240.0},
-        control={"tone": 0.1},
-        view=View((2.4, -1.9, 1.4), (0.0, -0.05, 1.12), (0.0125, 0.025, 0.0375, 0.05, 0.075, 0.1), color="distortion"),
-    )
-
-
 def belly_dents() -> list[Act]:
     """Return acts of a heavy ball pushed into a limp avatar's belly, with and without shape preservation."""
     thrown = ball(5.0, (0.0, BELLY[1] - BALL_RADIUS - 0.1, BELLY[2]), (0.0, 3.0, 0.0))
@@ -169,7 +201,7 @@ def belly_dents() -> list[Act]:
                 scene=SceneConfig(props=(thrown,)),
                 physics={"soft_young_modulus": 2e4},
                 control={"tone": 0.0, "alpha": alpha, "shape_preservation": kind},
-                view=View((2.6, -1.7, 1.4), (0.0, 0.1, 1.05), (0.1, 0.3, 1.3), color="strain"),
+                view=View((1.7, -1.0, 1.25), (0.0, -0.15, 1.05), (0.0667, 0.2), ("strain",)),
                 tags={"alpha": alpha, "shape_preservation": kind},
             )
         )
@@ -194,7 +226,7 @@ def crossed_legs() -> list[Act]:
                     seconds=2.4,
                     scene=SceneConfig(self_contact=fields, ground=False),
                     script=keyed((0.0, {}), (0.8, crossed), (1.1, crossed), (1.9, {})),
-                    view=View(eye=(0.9, -2.7, 0.7), target=(0.0, 0.0, 0.5), moments=(0.0, 1.1, 2.4)),
+                    view=View(eye=(0.7, -2.0, 0.8), target=(0.0, 0.0, 0.55), moments=(0.5, 1.1, 1.5)),
                     tags={"self_contact": fields, "pose": pose},
                 )
             )
@@ -215,7 +247,7 @@ def pillows(moduli: tuple[float, ...] = (1e3, 2e3, 5e3, 1e5)) -> list[Act]:
                 seconds=0.7,
                 scene=SceneConfig(props=(pillow,)),
                 control={"tone": 0.3},
-                view=replace(HEAD, eye=(2.2, -1.5, 1.65), moments=(0.0, 0.1333)),
+                view=replace(HEAD, eye=(1.9, -1.3, 1.6), moments=(0.0667, 0.1333)),
                 tags={"young_modulus_pa": young},
             )
         )
@@ -231,12 +263,13 @@ def cans(mesh: Path) -> list[Act]:
     )
     boot = RegionConfig(joints=("left_ankle", "left_foot"), young_modulus=5e5)
     lying = (0.7071, 0.0, 0.7071, 0.0)
-    above = View(eye=(1.0, -1.4, 1.9), target=(0.0, 0.0, 1.5), moments=(0.0667, 0.1333))
-    low = View(eye=(1.2, -1.2, 0.6), target=(0.15, -0.1, 0.15), moments=(0.0667, 0.1333))
+    both = ("skin", "strain")
+    above = View((0.6, -0.85, 1.85), (0.0, 0.0, 1.66), (0.0667,), both)
+    low = View((0.85, -0.75, 0.45), (0.15, -0.1, 0.14), (0.1,), both)
     sites = (
         ("head", hair, "hair", (0.0, -0.02, float(top) + 0.12), lying, down, above),
         ("belly", garment, "garment", (0.0, BELLY[1] - 0.12, BELLY[2]), lying, (0.0, CAN_SPEED, 0.0),
-         View(eye=(1.4, -1.2, 1.35), target=(0.0, -0.1, 1.05), moments=(0.0667, 0.1333))),
+         View((0.95, -0.8, 1.3), (0.0, -0.12, 1.06), (0.0667,), both)),
         ("ankle", boot, "stiff", (0.18, -0.28, 0.16), lying, (0.0, CAN_SPEED, 0.0), low),
     )  # fmt: skip
     found = []
@@ -266,7 +299,7 @@ def _modulus(regions: tuple[RegionConfig, ...]) -> float | None:
 def drops() -> list[Act]:
     """Return acts of a body that is set down from 0.3 m within 0.25 s: firm flesh, and soft flesh that lags."""
     down, up = {"root": (0.0, 0.0, 0.0)}, {"root": (0.0, 0.0, 0.3)}
-    view = View((3.7, -1.9, 1.35), (0.0, 0.1, 1.05), (0.75, 0.8667, 1.0, 1.1667), color="strain")
+    view = View((2.2, -1.2, 1.25), (0.0, -0.1, 1.12), (0.8667, 1.0), ("strain",))
     script = keyed((0.0, down), (0.6, up), (0.75, up), (1.0, down))
     return _landings("drop", script, 1.8, "scripted drop of 0.3 m", view)
 
@@ -277,7 +310,7 @@ def jumps() -> list[Act]:
         return []
     motion = load_motion(JUMP_CLIP)
     script = played(motion.translated([*-motion.root_position[0, :2], 0.0]))
-    view = View((4.6, -1.9, 1.1), (0.0, -0.55, 0.92), (0.0, 0.9667, 1.3333), color="strain")
+    view = View((4.6, -1.9, 1.1), (0.0, -0.55, 0.92), (0.0, 0.9667, 1.3333), ("strain",))
     return _landings("jump", script, 1.75, JUMP_CLIP, view)
 
 

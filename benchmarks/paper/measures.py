@@ -15,6 +15,9 @@ from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
 Row = dict[str, Any]
 LAST_SECONDS = 0.4  # over which a settled value is averaged
 NEAR = 0.12  # [m] from where something hits
+TOUCH = 0.01  # [N s] in a control step
+FRONT = 0.02  # |F - R| of a front of strain
+SLICE, TRUNK, LEAST_HEIGHT = 0.08, 0.2, 0.2  # [m]: thickness, half width, and height above the feet
 JIGGLING = 0.6  # softness of the flesh that is watched
 
 
@@ -114,16 +117,23 @@ def belly(course: Course) -> Row:
     }
 
 
+def overlap_of_legs(course: Course) -> np.ndarray:
+    """Return the volume that both legs fill, over that of the first moment [m^3], shape ``(T,)``."""
+    part, names = course.stage.simulation.flesh[0].part, list(BODY_PARTS)
+    left, right = (part == names.index(f"{side}_leg") for side in ("left", "right"))
+    overlap = np.array([overlap_volume(course, x, left, right) for x in course.x])
+    return overlap - overlap[0]
+
+
 def legs(course: Course) -> Row:
     """Measure the overlap of the legs, and their pose afterwards."""
     part, names = course.stage.simulation.flesh[0].part, list(BODY_PARTS)
     volume = course.stage.simulation.model.particles.volume.numpy()[0, : len(part)]
-    left, right = (part == names.index(f"{side}_leg") for side in ("left", "right"))
-    overlap = np.array([overlap_volume(course, x, left, right) for x in course.x])
-    worst = course.joint_errors.max(1)
+    left = part == names.index("left_leg")
+    overlap, worst = overlap_of_legs(course), course.joint_errors.max(1)
     return pose_error(course) | {
-        "peak_overlap_cm3": 1e6 * float(overlap.max() - overlap[0]),
-        "overlap_after_cm3": 1e6 * float(overlap[-1] - overlap[0]),
+        "peak_overlap_cm3": 1e6 * float(overlap.max()),
+        "overlap_after_cm3": 1e6 * float(overlap[-1]),
         "leg_volume_cm3": 1e6 * float(volume[left].sum()),
         "error_after_deg": float(worst[-1]),
         "joint_after": JOINT_NAMES[1 + int(course.joint_errors[-1].argmax())],
@@ -163,13 +173,17 @@ def pillow(course: Course) -> Row:
     }
 
 
-def can(course: Course) -> Row:
-    """Measure the response of a place of the body to a can."""
-    simulation = course.stage.simulation
-    way = course.speed[0, 0] / np.linalg.norm(course.speed[0, 0])
+def around_hit(course: Course) -> np.ndarray:
+    """Return a mask ``(P,)`` of the avatar's particles around the place of a can's hardest hit."""
     hit = int(np.linalg.norm(course.impulse[:, :, 1].sum(1), axis=1).argmax())
     # the skin is a can's radius and a little flesh away from where the can is
-    chosen = near(course, course.place[hit, 0], 1.5 * NEAR)
+    return near(course, course.place[hit, 0], 1.5 * NEAR)
+
+
+def can(course: Course) -> Row:
+    """Measure the response of a place of the body to a can."""
+    simulation, chosen = course.stage.simulation, around_hit(course)
+    way = course.speed[0, 0] / np.linalg.norm(course.speed[0, 0])
     row = contact(course) | {
         "rebound_m_s": float(-(course.speed[:, 0] @ way).min()),
         "peak_dent_mm": 1e3 * float(course.displacements(chosen).max()) if chosen.any() else None,
@@ -179,17 +193,17 @@ def can(course: Course) -> Row:
 
 
 def belly_flesh(course: Course) -> np.ndarray:
-    """Return a mask ``(P,)`` of the soft flesh of the belly."""
+    """Return a mask ``(P,)`` of the avatar's softest particles between pelvis and chest, on the front."""
     flesh = course.stage.simulation.flesh[0]
-    points, sampled = flesh.points, flesh.sampled
-    rest, low, high = points.rest[0], *(course.stage.simulation.asset.joints[[0, 6], 2])
+    sampled, rest = flesh.sampled, flesh.points.rest[0]
+    low, high = course.stage.simulation.asset.joints[[0, 6], 2]
     soft = softness(rest, sampled.bone, sampled.skin_joints, sampled.skin_weights)
     return (soft > JIGGLING) & (rest[:, 1] < 0.0) & (rest[:, 2] > low) & (rest[:, 2] < high)
 
 
 def jump(course: Course) -> Row:
     """Measure the motion of the belly's soft flesh relative to its bones, from the landing on."""
-    belly, sampled = belly_flesh(course), course.stage.simulation.flesh[0].sampled
+    sampled, belly = course.stage.simulation.flesh[0].sampled, belly_flesh(course)
     moved = 1e3 * course.displacements(belly)
     amplitude = np.sqrt((moved**2).mean(1))
     flight = int(course.joints[:, 0, 2].argmax())  # the landing is after the top
@@ -204,3 +218,47 @@ def jump(course: Course) -> Row:
         "rms_0.3_s_later_mm": float(later),
         "peak_joint_error_deg": float(course.joint_errors.max()),
     }
+
+
+def stickiness(course: Course) -> Row:
+    """Measure how far from the belly a ball is a step before it touches it, how long it does, and its speed after."""
+    touching = np.linalg.norm(course.impulse[:, :, 1].sum(1), axis=1) > TOUCH
+    return belly(course) | {
+        "gap_before_touch_mm": 1e3
+        * float(acts.BELLY[1] - acts.BALL_RADIUS - course.place[max(0, int(touching.argmax()) - 1), 0, 1]),
+        "contact_s": float(touching.sum() * course.stage.dt),
+        "restitution": float(-course.speed[:, 0, 1].min() / course.speed[0, 0, 1]),
+    }
+
+
+def waves(course: Course) -> Row:
+    """Measure how fast strain travels down from a blow, beside the speeds of waves in an elastic solid.
+
+    The front is at a height when the mean ``|F - R|`` there first reaches :data:`FRONT`.
+    """
+    height, strain = strain_by_height(course)
+    reached = strain >= FRONT
+    below = (height < acts.BELLY[2] - NEAR) & (height > LEAST_HEIGHT) & reached.any(0)
+    row: Row = {"peak_distortion": float(course.distortion.max()), "heights_reached": int(below.sum())}
+    row["height_m"] = height.tolist()
+    physics = course.stage.config.physics
+    young, nu, density = physics.young_modulus, physics.poisson_ratio, physics.density
+    row |= {
+        "shear_wave_m_s": float(np.sqrt(young / (2.0 * (1.0 + nu) * density))),
+        "pressure_wave_m_s": float(np.sqrt(young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu) * density))),
+    }
+    if below.sum() > 2:
+        row["front_m_s"] = -float(np.polyfit(course.time[reached.argmax(0)[below]], height[below], 1)[0])
+    return row
+
+
+def strain_by_height(course: Course) -> tuple[np.ndarray, np.ndarray]:
+    """Return heights ``(Z,)`` [m] of slices of trunk, head and legs at rest, and mean ``|F - R|`` there ``(T, Z)``."""
+    rest = course.stage.simulation.flesh[0].points.rest[0]
+    edges = np.arange(0.0, rest[:, 2].max(), SLICE)
+    chosen = np.abs(rest[:, 0]) < TRUNK
+    slices = [chosen & (rest[:, 2] >= low) & (rest[:, 2] < low + SLICE) for low in edges]
+    found = [
+        (low + 0.5 * SLICE, course.distortion[:, s].mean(1)) for low, s in zip(edges, slices, strict=True) if s.any()
+    ]
+    return np.array([at for at, _ in found]), np.array([mean for _, mean in found]).T

@@ -16,8 +16,9 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_in
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.motion import ease
-from piavatar_envs.config import EnvConfig, RenderConfig, SceneConfig, load_config
+from piavatar_envs.config import BodyColor, EnvConfig, RenderConfig, SceneConfig, load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.render.quantities import of_particles
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.sim.world import Simulation
 
@@ -75,13 +76,13 @@ class View:
     Attributes:
         eye, target: the camera and what it looks at [m].
         moments: times of the pictures [s].
-        color: of the bodies, as ``render.color``.
+        colors: of the body; each moment is drawn in all of them, see :mod:`piavatar_envs.render.quantities`.
     """
 
     eye: tuple[float, float, float] = (1.9, -3.1, 1.5)
     target: tuple[float, float, float] = (0.0, -0.1, 0.85)
     moments: tuple[float, ...] = (0.2,)
-    color: str = "skin"
+    colors: tuple[BodyColor, ...] = ("skin",)
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,7 @@ class Act:
 class _Backdrop:
     """Stand-in for the task that a renderer needs."""
 
+    config: EnvConfig
     camera_position: tuple[float, float, float]
     camera_target: tuple[float, float, float]
     camera_follows: bool = False
@@ -143,7 +145,7 @@ class Stage:
         settings = {"physics": physics, "control": act.control, "scene": act.scene, "render": render}
         self.config = config = load_config(EnvConfig, settings)
         self.simulation = Simulation(config, 1, device, act.domain)
-        self.task = _Backdrop(act.view.eye, act.view.target)
+        self.task = _Backdrop(config, act.view.eye, act.view.target)
         self.dt, self.steps_done = config.physics.control_dt, 0
         self._reset, self._step = LaunchGraph(self.simulation.device), LaunchGraph(self.simulation.device)
         everyone = wp.array([True], dtype=wp.bool, device=self.simulation.device)
@@ -178,20 +180,19 @@ class Course:
         stage: the world at the end.
         time: [s], shape ``(T,)``.
         x: particles [m], shape ``(T, P, 3)``.
-        F: their deformation gradients, by component, shape ``(T, 9, P)``.
         local, goal: tracked and commanded joint rotations, ``xyzw``, shape ``(T, 22, 4)``.
         bones, joints: tracked world rotations ``(T, 22, 4)`` and joint positions ``(T, 22, 3)`` [m].
         place, speed: of the props, shape ``(T, B, 3)`` [m], [m/s].
         dent: of the props: distance of their particles from their rest shape, RMS, shape ``(T, B)`` [m].
         impulse: on the body parts from every subject, shape ``(T, 6, S, 3)`` [N s].
         penetration: depth of the subjects in each other, shape ``(T, S)`` [m].
-        frames: pictures at the view's moments.
+        distortion: ``|F - R|`` of the avatar's particles, shape ``(T, A)``.
+        frames: pictures at the view's moments, in the view's colours.
     """
 
     stage: Stage
     time: np.ndarray
     x: np.ndarray
-    F: np.ndarray
     local: np.ndarray
     goal: np.ndarray
     bones: np.ndarray
@@ -201,6 +202,7 @@ class Course:
     dent: np.ndarray
     impulse: np.ndarray
     penetration: np.ndarray
+    distortion: np.ndarray
     frames: tuple[np.ndarray, ...] = ()
 
     @property
@@ -251,7 +253,7 @@ def perform(act: Act, fidelity: str = "coarse", device: str = "cpu", steps: int 
     stage = Stage(act, fidelity, device)
     count = steps or round(act.seconds / stage.dt)
     moments = {round(moment / stage.dt) for moment in act.view.moments} if size else set()
-    picture, frames, seen, shown = None, [], [], 0
+    pictures, frames, seen, shown = [], [], [], 0
     for step in range(count + 1):
         if step:
             stage.step()
@@ -259,10 +261,11 @@ def perform(act: Act, fidelity: str = "coarse", device: str = "cpu", steps: int 
         if step in moments:
             from piavatar_envs.api.pictures import Picture
 
-            picture = picture or Picture(stage, RenderConfig(width=size, height=size, color=act.view.color))
-            frames.append(picture.frame(0, stage.dt * (step - shown)))
+            looks = [RenderConfig(width=size, height=size, color=color) for color in act.view.colors]
+            pictures = pictures or [Picture(stage, look) for look in looks]
+            frames += [picture.frame(0, stage.dt * (step - shown)) for picture in pictures]
             shown = step
-    if picture:
+    for picture in pictures:
         picture.close()
     columns = {name: np.array([entry[name] for entry in seen]) for name in seen[0]}
     return Course(stage, stage.dt * np.arange(count + 1), **columns, frames=tuple(frames))
@@ -274,7 +277,6 @@ def _look(stage: Stage) -> dict[str, np.ndarray]:
     avatar, props, sensors = simulation.avatar, simulation.props.state, simulation.sensors
     arrays = {
         "x": simulation.state.x,
-        "F": simulation.state.F,
         "local": avatar.tracked.local,
         "goal": avatar.state.goal_rotation,
         "bones": avatar.tracked.rotation,
@@ -285,4 +287,6 @@ def _look(stage: Stage) -> dict[str, np.ndarray]:
         "impulse": sensors.part_impulse,
         "penetration": sensors.penetration,
     }
-    return {name: array.numpy()[0].copy() for name, array in arrays.items()}
+    copies = {name: array.numpy()[0].copy() for name, array in arrays.items()}
+    own = slice(avatar.body.first, avatar.body.first + avatar.body.count)
+    return copies | {"distortion": of_particles(simulation, 0, own, "distortion")}

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from agents import files
 from benchmarks import runner
-from benchmarks.paper import disturbance, figures, supplement, tracking
+from benchmarks.paper import acts, disturbance, figures, measures, supplement, tracking
 from benchmarks.paper.stage import Act, keyed, perform
 from benchmarks.physics import blows, contact, elastodynamics, stability, torque, wear
 from benchmarks.physics.limbs import Options
@@ -268,16 +268,36 @@ def test_every_study_of_the_supplement_is_judged(tmp_path, device):
     assert all(row["expectation"] and row["as_expected"] in (True, False) for row in rows)
 
 
-def test_a_figure_of_the_supplement_is_drawn(tmp_path):
+def test_a_figure_of_the_paper_is_drawn_and_measured(tmp_path, capsys, device):
     pytest.importorskip("PIL", reason="needs the extra render")
-    options = figures.Options(folder=tmp_path, only=("propagation",), fidelity="tiny", still=True)
-    (path,) = figures.main(options)
-    assert path.stat().st_size > 5_000
-    (act,) = json.loads(path.with_suffix(".json").read_text())["acts"]
-    near, far = act["distortion_0_to_10_cm"], act["distortion_30_to_40_cm"]
-    assert len(act["time_s"]) == len(near) == 37 and max(near) > 2.0 * max(far)
-    with pytest.raises(ValueError, match="limb_fields"):
-        figures.main(replace(options, only=("legs",)))
+    pytest.importorskip("matplotlib", reason="needs the extra train")
+    options = figures.Options("several_objects", tmp_path, "tiny", device, steps=2)
+    picture, measured = figures.main(options)
+    assert picture.stat().st_size > 5_000
+    report = json.loads(measured.read_text())
+    assert report["commit"] and report["device"] and report["versions"]["python"]
+    (row,) = report["results"]
+    assert set(row["series"]) == {"ball", "box", "capsule", "torus"} and len(row["time_s"]) == 3 and not row["failed"]
+    assert figures.main(replace(options, name="list")) == [] and "belly_mass" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="resistance"):
+        figures.main(replace(options, name="arms"))
+
+
+def test_heavier_balls_dent_a_belly_more(device):
+    courses = [perform(act, "tiny", device) for act in acts.belly_balls()]
+    rows = [measures.belly(course) for course in courses]
+    assert np.diff([row["peak_mean_dent_mm"] for row in rows]).min() > 0.0
+    for act, row in zip(acts.belly_balls(), rows, strict=True):
+        most = 2.0 * 3.0 * act.tags["ball_kg"]  # of an elastic rebound
+        assert 0.5 * most < row["impulse_n_s"] < most
+
+
+@pytest.mark.parametrize(("young", "speed"), [(1e4, 3.67), (1e5, 11.6)])
+def test_strain_of_a_blow_travels_as_pressure_waves_do(young, speed, device):
+    act = acts.blow()
+    row = measures.waves(perform(replace(act, physics={**act.physics, "young_modulus": young}), "coarse", device))
+    assert row["pressure_wave_m_s"] == pytest.approx(speed, rel=0.01) and row["heights_reached"] >= 6
+    assert row["front_m_s"] == pytest.approx(speed, rel=0.2)
 
 
 def test_every_environment_is_scored(monkeypatch):
