@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
     from piavatar_envs.envs.pixels import PixelObserver
-    from piavatar_envs.render import Arrow, Marker, MovedSplats, Scene
+    from piavatar_envs.render import Arrow, Body, Marker, MovedSplats, Scene
     from piavatar_envs.render.live import Drag, LiveView
     from piavatar_envs.render.stage import Stage
     from piavatar_envs.sim.markers import MarkerSpec
@@ -120,9 +120,8 @@ class SceneReader:
         for number, part in enumerate(self.stage.parts):
             own = vertices[part.vertices]
             if part.kind in ("avatar", "prop"):
-                scalars = self._scalars(env, len(bodies), color)
-                splats = self._splats(len(bodies)) if color == "skin" and part.kind == "avatar" else None
-                bodies.append(Body(own, part.faces, part.color, part.colors, splats=splats, **scalars))
+                body = Body(own, part.faces, part.color, part.colors, splats=self._splats(len(bodies)))
+                bodies.append(self._colored(body, env, len(bodies), color))
             elif np.isfinite(own[0, 0]):  # hidden ones are NaN
                 markers.append(Solid(part.kind, own, part.faces, part.color, number - len(bodies)))
         if self.batch.config.render.overlays:
@@ -132,24 +131,29 @@ class SceneReader:
         return Scene(bodies, markers, follow)
 
     def _splats(self, index: int) -> MovedSplats | None:
-        """Return the splats of an avatar, if it is drawn as such."""
+        """Return the splats of a body, if it is drawn as such."""
         splats = self.stage.splats
         return None if splats is None or index not in splats.bound else splats.moved(0, index)
 
-    def _scalars(self, env: int, body: int, color: BodyColor) -> dict[str, Any]:
-        """Return the fields of a body in the scene that colour it by a quantity; none if it has its own colours."""
+    def _colored(self, body: Body, env: int, index: int, color: BodyColor) -> Body:
+        """Return a body, and its splats, coloured by a quantity, unless it keeps its own colours."""
+        from piavatar_envs.render.coloring import color_by
         from piavatar_envs.render.quantities import QUANTITIES, of_particles
 
         simulation, avatars = self.batch.simulation, len(self.stage.skins)
-        if color == "skin" or (color == "impulse" and body >= avatars):
-            return {}
-        if body < avatars:
-            matter, surface = simulation.avatars[body].body, self.stage.skins[body]
+        if color == "skin" or (color == "impulse" and index >= avatars):
+            return body
+        if index < avatars:
+            matter, surface = simulation.avatars[index].body, self.stage.skins[index]
         else:
-            matter, surface = simulation.props.props[body - avatars], self.stage.solids[body - avatars]
+            matter, surface = simulation.props.props[index - avatars], self.stage.solids[index - avatars]
         own, scale = slice(matter.first, matter.first + matter.count), QUANTITIES[color]
-        scalars = surface.interpolate(of_particles(simulation, env, own, color))
-        return {"scalars": scalars, "scalar_max": scale.maximum, "scalar_label": scale.label}
+        values, splats = of_particles(simulation, env, own, color), body.splats
+        if splats is not None:
+            of_splats = self.stage.splats.bound[index].skin.interpolate(values)
+            splats = replace(splats, colors=color_by(of_splats, scale.maximum))
+        scalars = surface.interpolate(values)
+        return replace(body, scalars=scalars, scalar_max=scale.maximum, scalar_label=scale.label, splats=splats)
 
 
 class Progress:

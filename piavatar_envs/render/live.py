@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
-from piavatar_envs.avatar.body.splats import SplatCloud, harmonics
+from piavatar_envs.avatar.body.splats import SplatCloud, mean_colors
 from piavatar_envs.core.extras import missing
 from piavatar_envs.render import ground
 from piavatar_envs.render.coloring import bands_of, strain_table
@@ -259,22 +259,27 @@ def pack_splats(splats: MovedSplats) -> np.ndarray:
     """Return splats as browsers take them, :data:`_SPLAT_SCALE` times as large, shape ``(S, 8)`` uint32.
 
     A row has the centre as single and the covariance as half precision, and the colour as bytes, the mean over all
-    directions. Covariances of splats of millimetres in metres would be zero in half precision.
+    directions if it depends on them. Covariances of splats of millimetres in metres would be zero in half precision.
     """
     packed = np.zeros((len(splats.means), 8), np.uint32)
     packed[:, :3] = np.ascontiguousarray(np.float32(_SPLAT_SCALE) * _drawable(splats.means)).view(np.uint32)
     covariances = np.nan_to_num(np.asarray(splats.covariances, np.float32) * _SPLAT_SCALE**2, posinf=0.0, neginf=0.0)
     halves = np.ascontiguousarray(np.clip(covariances, -_LARGEST, _LARGEST), np.float16)
     packed[:, 4:7] = halves.view(np.uint32)
-    packed[:, 7] = _tint(splats.cloud)
+    opacities = splats.cloud.opacities
+    packed[:, 7] = _tint(splats.cloud) if splats.colors is None else _color_bytes(splats.colors, opacities)
     return packed
 
 
 @lru_cache(maxsize=16)
 def _tint(cloud: SplatCloud) -> np.ndarray:
+    """Return the bytes of a cloud's own colours, which stay."""
+    return _color_bytes(mean_colors(cloud.sh), cloud.opacities)
+
+
+def _color_bytes(colors: np.ndarray, opacities: np.ndarray) -> np.ndarray:
     """Return colours and opacities as bytes, four in one number, shape ``(S,)`` uint32."""
-    colors = 0.5 + harmonics(np.array([0.0, 0.0, 1.0]), 0) * cloud.sh[:, 0]
-    rgba = np.concatenate([colors, cloud.opacities[:, None]], axis=1)
+    rgba = np.concatenate([colors, opacities[:, None]], axis=1)
     return np.rint(255.0 * np.clip(rgba, 0.0, 1.0)).astype(np.uint8).view(np.uint32)[:, 0]
 
 

@@ -1,6 +1,6 @@
 """Quantities that colour bodies in pictures: measures of the deformation gradient, and contact impulses.
 
-Each is a number of every particle, which the skin interpolates, as the colours of splats may.
+Each is a number of every particle, which skins and splats interpolate with the weights by which particles move them.
 """
 
 from __future__ import annotations

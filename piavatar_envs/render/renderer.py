@@ -10,7 +10,7 @@ from types import TracebackType
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body.splats import SplatCloud, joined_colors
+from piavatar_envs.avatar.body.splats import joined_colors
 from piavatar_envs.core.capture_lock import CAPTURE
 from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -107,7 +107,8 @@ class Renderer:
             ]
         )
         splats = [body.splats for body in bodies if body.splats is not None]
-        key = (tuple((id(faces), len(own)) for own, faces in meshes), tuple(id(each.cloud) for each in splats))
+        clouds = tuple((id(each.cloud), each.colors is None) for each in splats)
+        key = (tuple((id(faces), len(own)) for own, faces in meshes), clouds)
         # A picture that is interrupted leaves samples behind: its painter is not used again.
         shown, self._shown = self._shown, None
         if shown is None or shown.key != key:
@@ -116,7 +117,7 @@ class Renderer:
                 parts[index] = replace(parts[index], is_drawn=body.splats is None)
             with CAPTURE.exclusive():
                 painter = Painter(Surfaces.build(parts, self._device), 1, self.height, self.width, self._device)
-                shown = _Shown(key, [mesh[1] for mesh in meshes], [each.cloud for each in splats], painter)
+                shown = _Shown(key, [mesh[1] for mesh in meshes], splats, painter)
         with CAPTURE.shared():
             picture = shown.draw(vertices, albedo, splats, shot)
         self._shown = shown
@@ -151,13 +152,16 @@ class _Shown:
     The launches are made one by one, because a captured graph would exclude other threads while it is captured.
     """
 
-    def __init__(self, key: tuple, faces: Sequence[np.ndarray], clouds: Sequence[SplatCloud], painter: Painter) -> None:
+    def __init__(
+        self, key: tuple, faces: Sequence[np.ndarray], splats: Sequence[MovedSplats], painter: Painter
+    ) -> None:
         self.key, self._painter = key, painter
+        clouds = [each.cloud for each in splats]
         self._owners = faces, clouds  # an id is only unique while its owner lives
         self._splats: SplatPainter | None = None
         if clouds:
             size, opacities = (1, painter.height, painter.width), np.concatenate([each.opacities for each in clouds])
-            self._splats = SplatPainter(opacities, joined_colors(clouds), *size, painter.device)
+            self._splats = SplatPainter(opacities, joined_colors([each.sh for each in splats]), *size, painter.device)
             painter.layers.append(self._splats)
         graph = LaunchGraph(painter.device)
         painter.record(graph)
@@ -167,6 +171,8 @@ class _Shown:
         """Draw the meshes with these vertices ``(V, 3)`` [m] and linear colours ``(V, 3)``; returns a copy."""
         for name in ("means", "covariances", "turns") if splats else ():
             getattr(self._splats, name).assign(np.concatenate([getattr(each, name) for each in splats])[None])
+        if any(each.colors is not None for each in splats):
+            self._splats.harmonics.assign(joined_colors([each.sh for each in splats]))
         painter = self._painter
         painter.vertices.assign(vertices[None])
         painter.surfaces.albedo.assign(albedo[None])

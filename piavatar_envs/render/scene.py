@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.splats import SplatCloud
+from piavatar_envs.avatar.body.splats import SplatCloud, constant_colors
 from piavatar_envs.render.markers import placed_mesh, turn_to_direction
 from piavatar_envs.sim.markers import TARGET, WIRE
 
@@ -33,12 +33,19 @@ class MovedSplats:
         means: centres [m], shape ``(S, 3)``.
         covariances: xx, xy, xz, yy, yz, zz [m^2], shape ``(S, 6)``.
         turns: rotations from the rest pose, quaternions xyzw, shape ``(S, 4)``.
+        colors: sRGB in [0, 1] instead of the cloud's, the same from all sides, shape ``(S, 3)``.
     """
 
     cloud: SplatCloud
     means: np.ndarray
     covariances: np.ndarray
     turns: np.ndarray
+    colors: np.ndarray | None = None
+
+    @property
+    def sh(self) -> np.ndarray:
+        """Coefficients of the colours in the frame of the rest pose, shape ``(S, K, 3)`` float32."""
+        return self.cloud.sh if self.colors is None else constant_colors(self.colors)
 
     @staticmethod
     def resting(cloud: SplatCloud, shift: np.ndarray) -> MovedSplats:
@@ -50,7 +57,8 @@ class MovedSplats:
     def as_cloud(self) -> SplatCloud:
         """Return a cloud of these splats, whose colours have turned with them."""
         covariances = self.covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-        return SplatCloud.deformed(self.cloud, self.means, covariances, Rotation.from_quat(self.turns).as_matrix())
+        colored = replace(self.cloud, sh=self.sh)
+        return SplatCloud.deformed(colored, self.means, covariances, Rotation.from_quat(self.turns).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +73,7 @@ class Body:
         scalars: what to colour by instead, shape ``(V,)``, for example the strain.
         scalar_max: the value of the last colour; the range is ``[0, scalar_max]``, the same in every frame.
         scalar_label: title of the colour scale.
-        splats: what is drawn instead of the mesh, which then casts shadows only.
+        splats: what is drawn instead of the mesh, which then casts shadows only; they have their own colours.
     """
 
     vertices: np.ndarray

@@ -265,7 +265,7 @@ class SplatMotion:
     @cached_property
     def sh(self) -> np.ndarray:
         """Coefficients of their colours at rest, shape ``(S, K, 3)`` float32."""
-        return joined_colors([one.cloud for one in self.bound.values()])
+        return joined_colors([one.cloud.sh for one in self.bound.values()])
 
     def __len__(self) -> int:
         return len(self.opacities)

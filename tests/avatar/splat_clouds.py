@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors
-from piavatar_envs.avatar.body.splats import COEFFICIENTS, SplatCloud, harmonics
+from piavatar_envs.avatar.body.splats import COEFFICIENTS, SplatCloud, constant_colors
 
 _SKIN, _SHIRT, _STRIPE, _TROUSERS = (0.85, 0.65, 0.55), (0.75, 0.15, 0.2), (0.92, 0.9, 0.85), (0.18, 0.25, 0.45)
 
@@ -47,7 +47,7 @@ def on_body(
     means -= inset * size * normal
     rest = asset.vertices[asset.faces[chosen, 0]]
     sh = np.zeros((count, COEFFICIENTS[degree], 3))
-    sh[:, 0] = (_colors(rest) - 0.5) / harmonics([0.0, 0.0, 1.0], 0)
+    sh[:, :1] = constant_colors(_colors(rest))
     sh[:, 1:] = 0.05 * rng.standard_normal(sh[:, 1:].shape)
     return SplatCloud.of(
         means, turns.as_quat(), np.tile([size, size, 0.15 * size], (count, 1)), np.full(count, 0.97), sh

@@ -80,6 +80,11 @@ def test_splats_are_shown_instead_of_the_mesh(view, body):
     view.show(Scene([replace(body, splats=moved)], []), 0.1)
     assert handle(view, "body_0_splats") is shown
     np.testing.assert_allclose(shown.centers * scale, moved.means, atol=1e-6)
+    colors = np.linspace(0.0, 1.0, 600).reshape(200, 3)
+    view.show(Scene([replace(body, splats=replace(moved, colors=colors))], []), 0.1)
+    sent = shown.buffer[:, 7].copy().view(np.uint8).reshape(-1, 4)
+    np.testing.assert_array_equal(sent[:, :3], np.rint(255.0 * colors))
+    np.testing.assert_array_equal(sent[:, 3], np.rint(255.0 * cloud.opacities))
     view.show(Scene([body], []), 0.1)
     assert names(view) == {"body_0"}
 

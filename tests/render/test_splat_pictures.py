@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from scipy.ndimage import binary_dilation
 
 from piavatar_envs.api.pictures import SceneReader
@@ -14,10 +15,14 @@ from piavatar_envs.avatar.body.sources import load_asset, register_source
 from piavatar_envs.avatar.body.splats import SkinnedSplats
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render.cameras import BatchCamera
+from piavatar_envs.render.coloring import color_by
 from piavatar_envs.render.painter import Painter
+from piavatar_envs.render.quantities import QUANTITIES
+from piavatar_envs.render.renderer import Renderer
 from piavatar_envs.render.scene import Camera
 from piavatar_envs.render.stage import Stage
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
+from piavatar_envs.render.views import Shot
 from tests.avatar.splat_clouds import on_body
 from tests.render.batches import act
 
@@ -87,13 +92,61 @@ def test_a_bent_arm_has_no_holes(make_batch):
     assert binary_dilation(drawn, iterations=3)[covered].all()  # splats reach a pixel or two beyond
 
 
-def test_render_draws_splats_unless_colours_are_strain(make_env):
+def test_render_draws_splats(make_env):
     env = make_env("PIAvatar/Reach-v0", render_mode="rgb_array", **SPLATS, **{"render.width": 64, "render.height": 64})
     env.reset(seed=3)
     red, green, _ = env.render().astype(int).reshape(-1, 3).T
     assert (red > green + 60).sum() > 60
-    strained = SceneReader(env.batch).scene(0, "strain").bodies[0]
-    assert strained.splats is None and strained.scalars is not None
+
+
+@pytest.mark.parametrize("color", ["strain", "distortion"])
+def test_a_uniform_strain_gives_all_splats_the_colour_of_the_map(make_batch, color):
+    """And so does the picture, in the midst of the body, where nothing but splats is seen."""
+    batch = make_batch("PIAvatar/Reach-v0", **SPLATS)
+    batch.reset(seeds=[3])
+    F, scale = batch.simulation.state.F, QUANTITIES[color]
+    # both quantities of one stretch are its departure from one; 0.6 of the scale is in the midst of a colour
+    F.assign(np.broadcast_to(np.diag([1.0, 1.0 + 0.6 * scale.maximum, 1.0]).reshape(9, 1), F.shape).astype(np.float32))
+    body = SceneReader(batch).scene(0, color).bodies[0]
+    expected = color_by([0.6], 1.0)
+    np.testing.assert_array_equal(body.splats.colors, np.tile(expected, (len(body.splats.cloud), 1)))
+    np.testing.assert_array_equal(body.splats.sh.shape[1:], (1, 3))
+    np.testing.assert_allclose(body.splats.as_cloud().colors(np.array([0.6, 0.0, 0.8])), body.splats.colors, atol=1e-6)
+    with Renderer(96, 96) as renderer:
+        plain = renderer.render([dataclasses.replace(body, scalars=None)], follow=body.vertices.mean(axis=0))
+    trunk = np.abs(plain[42:48, 46:50].astype(int) - np.rint(255.0 * expected))
+    assert trunk.max() <= 2
+
+
+def test_splats_show_where_a_body_was_struck(make_batch, equal):
+    """A renderer that has drawn the same splats before draws them with the present colours, and with their own."""
+    ball = {"name": "ball", "size": [0.12], "mass": 4, "position": [0, -0.6, 1.05], "velocity": [0, 6, 0]}
+    batch = make_batch("PIAvatar/Reach-v0", **SPLATS, **{"scene.props": [ball]})
+    batch.reset(seeds=[3])
+    reader, camera = SceneReader(batch), Camera((0.0, -4.0, 1.0), (0.0, 0.0, 1.0))
+
+    def draw(*colors: str) -> list[np.ndarray]:
+        """Draw the body without the ball."""
+        with Renderer(120, 120, camera, scale=False) as renderer:
+            return [renderer.render([reader.scene(0, color).bodies[0]]) for color in colors]
+
+    with Renderer(120, 120, camera, scale=False) as renderer:
+        still = renderer.render([reader.scene(0, "strain").bodies[0]])
+        for _ in range(3):
+            batch.step()
+        body = reader.scene(0, "strain").bodies[0]
+        struck, own = renderer.render([body]), renderer.render([reader.scene(0).bodies[0]])
+    for again, picture in zip(draw("strain", "skin"), (struck, own), strict=True):
+        assert equal(again, picture)
+    rest = color_by([0.0], 1.0)
+    most = np.square(body.splats.colors - rest).sum(axis=1).argmax()
+    place = body.splats.means[most]
+    assert np.linalg.norm(place - batch.simulation.props.state.position.numpy()[0, 0]) < 0.16
+    shot = Shot(np.array(camera.position), np.array(camera.target), camera.field_of_view, np.zeros(2))
+    x, y = shot.project(place[None], 120, 120)[0].astype(int)
+    np.testing.assert_allclose(still[y, x] / 255.0, rest[0], atol=0.01)
+    np.testing.assert_allclose(struck[y, x] / 255.0, body.splats.colors[most], atol=0.06)
+    assert np.abs(struck[y, x].astype(int) - still[y, x]).max() > 40
 
 
 def test_observed_pictures_show_splats(make_batch, equal):

@@ -157,15 +157,24 @@ class SkinnedSplats:
     skin_weights: np.ndarray
 
 
-def joined_colors(clouds: Sequence[SplatCloud]) -> np.ndarray:
-    """Return the coefficients of the colours of several clouds, shape ``(S, K, 3)``, ``K`` of the highest degree."""
-    degree = max((cloud.degree for cloud in clouds), default=0)
-    joined = np.zeros((sum(map(len, clouds)), COEFFICIENTS[degree], 3), np.float32)
-    first = 0
-    for cloud in clouds:
-        joined[first : first + len(cloud), : cloud.sh.shape[1]] = cloud.sh
-        first += len(cloud)
+def joined_colors(coefficients: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the coefficients of the colours of several clouds, shape ``(S, K, 3)``, ``K`` the largest of theirs."""
+    most = max((sh.shape[1] for sh in coefficients), default=1)
+    joined, first = np.zeros((sum(map(len, coefficients)), most, 3), np.float32), 0
+    for sh in coefficients:
+        joined[first : first + len(sh), : sh.shape[1]] = sh
+        first += len(sh)
     return joined
+
+
+def mean_colors(sh: np.ndarray) -> np.ndarray:
+    """Return the means of colours over all directions, of coefficients ``(S, K, 3)``, shape ``(S, 3)``."""
+    return 0.5 + _FACTORS[0] * sh[:, 0]
+
+
+def constant_colors(colors: np.ndarray) -> np.ndarray:
+    """Return the coefficients of colours ``(S, 3)`` that are the same from all sides, shape ``(S, 1, 3)`` float32."""
+    return ((np.asarray(colors) - 0.5) / _FACTORS[0]).astype(np.float32)[:, None]
 
 
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:

@@ -28,7 +28,7 @@ from piavatar_envs.avatar.body.splat_registration import (
     opaque_box,
     register_splats,
 )
-from piavatar_envs.avatar.body.splats import SkinnedSplats, SplatCloud, harmonics
+from piavatar_envs.avatar.body.splats import SkinnedSplats, SplatCloud, mean_colors
 from piavatar_envs.core.reading import reading
 from piavatar_envs.core.result_cache import digest_of, kept
 
@@ -215,6 +215,6 @@ def _owner(joint: int, joints: int) -> int:
 def _colors(cloud: SplatCloud, points: np.ndarray) -> np.ndarray:
     """Return sRGB of the opaque splats around points, shape ``(V, 3)`` uint8."""
     own = cloud.chosen(cloud.opacities > OPAQUE)
-    plain = np.clip(0.5 + own.sh[:, 0] * harmonics(np.array([0.0, 0.0, 1.0]), 0), 0.0, 1.0)
+    plain = np.clip(mean_colors(own.sh), 0.0, 1.0)
     near = cKDTree(own.means).query(points, k=min(_COLOR_SPLATS, len(own)))[1].reshape(len(points), -1)
     return np.rint(255.0 * plain[near].mean(axis=1)).astype(np.uint8)
