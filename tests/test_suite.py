@@ -174,8 +174,9 @@ def test_reward_is_the_sum_of_its_terms(make_env, env_id):
         assert tuple(terms) == task.reward_names and np.isfinite(list(terms.values())).all()
         assert reward == pytest.approx(sum(terms.values()), abs=1e-6)
         assert set(task.metric_names) <= set(info) and all(np.isfinite(info[name]) for name in task.metric_names)
-        # the shaping is at most one; the cost of actions is the only negative term
-        assert -env.config.control_cost <= reward <= 1.0
+        # the shaping is at most one; only costs are negative
+        costs = env.config.control_cost + getattr(env.config, "stance_cost", 0.0)
+        assert -costs <= reward <= 1.0
     for scale in (0.0, 0.5, 7.0):
         env.reset(seed=0)
         info = env.step(np.full(env.action_space.shape, scale, np.float32))[4]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, mesh_volume
+from piavatar_envs.avatar.body.asset import dense_weights, mesh_volume
 from piavatar_envs.avatar.body.sampling import (
     LIMB_GROUPS,
     LINK_LENGTH,
@@ -219,7 +221,7 @@ def test_morphing_to_the_mean_changes_nothing(asset, coarse):
 def test_morphing_is_exact_for_an_affine_change(asset, coarse):
     # A body stretched as a whole stretches its interior alike, and every volume by the same factor.
     stretch = np.array([1.1, 0.95, 1.2])
-    wide = AvatarAsset(**{**vars(asset), "vertices": (asset.vertices * stretch).astype(np.float32)})
+    wide = dataclasses.replace(asset, vertices=(asset.vertices * stretch).astype(np.float32))
     body = wide.mean_body()
     positions, volumes = morph(asset, coarse, body)
     error = np.linalg.norm(positions - coarse.rest_positions * stretch, axis=1)
@@ -238,7 +240,7 @@ def test_a_joint_outside_the_skin_is_refused(asset):
     joints = asset.joints.copy()
     joints[joint_index("left_knee")] += [1.0, 0.0, 0.0]
     joints[joint_index("left_ankle")] += [1.0, 0.0, 0.0]
-    broken = AvatarAsset(**{**vars(asset), "joints": joints})
+    broken = dataclasses.replace(asset, joints=joints)
     with pytest.raises(ValueError, match="left_hip lies outside"):
         sample_particles(broken, 0.05)
 
