@@ -120,7 +120,8 @@ def draw(asset: AvatarAsset, path: Path) -> None:
     shift = body.vertices[0].astype(np.float64) - asset.vertices[0]
     look = asset.drawn
     splats = None if look.splats is None else MovedSplats.resting(look.splats.cloud, shift)
-    surface = Body((look.vertices + shift).astype(np.float32), look.faces, colors=look.colors_of(0), splats=splats)
+    own = {"colors": look.colors_of(0), "splats": splats, "textures": look.textures}
+    surface = Body((look.vertices + shift).astype(np.float32), look.faces, **own)
     joints = body.joints.astype(np.float64)
     bones = [_bone(joints[PARENTS[joint]], joints[joint], Capsule) for joint in range(1, len(JOINT_NAMES))]
     skeleton = [*bones, *(Sphere(joint, _JOINT) for joint in joints)]

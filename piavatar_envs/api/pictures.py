@@ -120,7 +120,8 @@ class SceneReader:
         for number, part in enumerate(self.stage.parts):
             own = vertices[part.vertices]
             if part.kind in ("avatar", "prop"):
-                body = Body(own, part.faces, part.color, part.colors, splats=self._splats(len(bodies)))
+                splats = self._splats(len(bodies))
+                body = Body(own, part.faces, part.color, part.colors, splats=splats, textures=part.textures)
                 bodies.append(self._colored(body, env, len(bodies), color))
             elif np.isfinite(own[0, 0]):  # hidden ones are NaN
                 markers.append(Solid(part.kind, own, part.faces, part.color, number - len(bodies)))

@@ -1,29 +1,29 @@
 """Surfaces of a glTF file: triangles, skinning and colours, in the pose that the skin was bound in.
 
-Colours are those of the base: factor times vertex colour times texture, which is sampled at the vertices. Morph
-targets, normals and every other texture are left out.
+Colours are those of the base: factor times vertex colour times texture, which is also sampled at the vertices for
+pictures without textures. Morph targets, normals and every other texture are left out.
 """
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from piavatar_envs.avatar.body.groups import MOST_GROUPS
+from piavatar_envs.avatar.body.textures import CLAMP, MIRROR, REPEAT, Texture, Textures, decoded
 from piavatar_envs.avatar.gltf import MAX_VALUES, Gltf, numbers, whole
 from piavatar_envs.core.extras import install_command
 from piavatar_envs.core.reading import UNREADABLE, first_line, reading
+from piavatar_envs.core.srgb import linear_to_srgb
 
 MAX_VERTICES, MAX_TRIANGLES = 6_000_000, 6_000_000
-MAX_PIXELS = 2**26  # of a texture
-TEXTURE_SIDE = 1024  # [pixels] to which larger textures are averaged down
+MAX_IMAGES = 64  # of textures of a file
+MAX_UV = 1.0e4  # images to either side, far more than single precision can place well
 MAX_SETS = 4  # of JOINTS_n and WEIGHTS_n
 SAME_PLACE = 5e-3  # of the size of a skeleton, within which skins agree on a joint
 _SIMPLIFY = "simplify it with: npx @gltf-transform/cli simplify IN.glb OUT.glb"
-_REPEAT, _CLAMP, _MIRROR = 10497, 33071, 33648
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,9 @@ class Piece:
         faces: shape ``(T, 3)`` int64.
         nodes: that move each vertex, shape ``(V, K)`` int64.
         weights: their weights, rows sum to one, shape ``(V, K)`` float64.
-        colors: sRGB, shape ``(V, 3)`` uint8.
+        colors: sRGB, of the texture as well, shape ``(V, 3)`` uint8.
         painted: weights in [0, 1] by lower-case name, each shape ``(V,)`` float64.
+        textures: of the base colour; None without one.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Piece:
     weights: np.ndarray
     colors: np.ndarray
     painted: dict[str, np.ndarray]
+    textures: Textures | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +179,8 @@ class _Reader:
     gltf: Gltf
     notes: list[str] = field(default_factory=list)
     _arrays: dict[int, np.ndarray] = field(default_factory=dict)
-    _textures: dict[int, np.ndarray | None] = field(default_factory=dict)
+    _textures: dict[int, Texture | None] = field(default_factory=dict)
+    _images: dict[int, np.ndarray | None] = field(default_factory=dict)
 
     def pieces(self) -> list[Piece]:
         """Return the triangles of all nodes that are shown."""
@@ -229,10 +232,11 @@ class _Reader:
             nodes, weights = self.skinning(attributes, skin, used, len(points), what)
         number = primitive.get("material")
         material = {} if number is None else self.gltf.item("materials", number)
-        colors = self.colors(material, attributes, used, len(points), what)
+        colors, textures = self.textured(material, attributes, used, faces, len(points), what)
         label = str(material.get("name", ""))[:200]
         painted = self.painted(attributes, used, len(points))
-        return Piece(name, index, skin, label, points[used].astype(np.float64), faces, nodes, weights, colors, painted)
+        points = points[used].astype(np.float64)
+        return Piece(name, index, skin, label, points, faces, nodes, weights, colors, painted, textures)
 
     def painted(self, attributes: dict[str, Any], used: np.ndarray, count: int) -> dict[str, np.ndarray]:
         """Return scalar attributes of the file's author, of which the names begin with ``_``, with values in [0, 1]."""
@@ -296,10 +300,11 @@ class _Reader:
             weights[total < 1e-6, 0] = 1.0
         return joints[which], weights / weights.sum(axis=1, keepdims=True)
 
-    def colors(
-        self, material: dict[str, Any], attributes: dict[str, Any], used: np.ndarray, count: int, what: str
-    ) -> np.ndarray:
-        """Return base colours of the vertices, sRGB, shape ``(V, 3)`` uint8."""
+    def textured(
+        self, material: dict[str, Any], attributes: dict[str, Any], used: np.ndarray, faces: np.ndarray, count: int,
+        what: str,
+    ) -> tuple[np.ndarray, Textures | None]:  # fmt: skip
+        """Return sRGB base colours of the vertices, ``(V, 3)`` uint8, and the textures that give them, if any."""
         base = material.get("pbrMetallicRoughness") or {}
         factor, texture = base.get("baseColorFactor"), base.get("baseColorTexture")
         older = (material.get("extensions") or {}).get("KHR_materials_pbrSpecularGlossiness")
@@ -313,24 +318,25 @@ class _Reader:
             if stored.shape[1] not in (3, 4) or len(stored) != count:
                 raise ValueError(f"COLOR_0 of the {what} has shape {stored.shape} for {count} vertices")
             linear = linear * stored[used, :3]
-        if texture is not None:
-            linear = linear * self.sampled(texture, attributes, used, count, what)
-        linear = np.clip(linear, 0.0, 1.0)
-        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-        return np.round(255.0 * srgb).astype(np.uint8)
+        tints = np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
+        placed = None if texture is None else self.placed(texture, attributes, used, count, what)
+        if placed is None:
+            return tints, None
+        textures = Textures((placed[0],), np.zeros(len(faces), np.int32), placed[1].astype(np.float32), tints)
+        return textures.colors(faces), textures
 
-    def sampled(
+    def placed(
         self, info: dict[str, Any], attributes: dict[str, Any], used: np.ndarray, count: int, what: str
-    ) -> np.ndarray:
-        """Return linear colours of a texture at the vertices, shape ``(V, 3)``; white where it cannot be read."""
+    ) -> tuple[Texture, np.ndarray] | None:
+        """Return a texture, and the places of the vertices in it, ``(V, 2)``; None where it cannot be read."""
         number = whole(info.get("index"), "index of a texture", len(self.gltf.items("textures")) - 1)
         if number not in self._textures:
             self._textures[number] = self.texture(number)
-        pixels = self._textures[number]
+        texture = self._textures[number]
         moved = (info.get("extensions") or {}).get("KHR_texture_transform") or {}
         channel = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
-        if pixels is None or channel not in attributes:
-            return np.ones((len(used), 3))
+        if texture is None or channel not in attributes:
+            return None
         uv = self.array(attributes[channel], 2, f"{channel} of the {what}")
         if len(uv) != count:
             raise ValueError(f"{channel} of the {what} has {len(uv)} rows for {count} vertices")
@@ -338,60 +344,41 @@ class _Reader:
         turn = numbers([moved.get("rotation", 0)], 1, "rotation of a texture")[0]
         cos, sin = np.cos(turn), np.sin(turn)
         uv = uv @ np.array([[cos, -sin], [sin, cos]]) + numbers(moved.get("offset", (0, 0)), 2, "offset of a texture")
-        sampler = self.gltf.item("textures", number).get("sampler")
-        wraps = {} if sampler is None else self.gltf.item("samplers", sampler)
-        height, width = pixels.shape[:2]
-        x0, x1, tx = _neighbours(uv[:, 0], width, wraps.get("wrapS", _REPEAT))
-        y0, y1, ty = _neighbours(uv[:, 1], height, wraps.get("wrapT", _REPEAT))
-        value = pixels / 255.0
-        corners = [value[y, x] for y in (y0, y1) for x in (x0, x1)]
-        rows = [a + tx[:, None] * (b - a) for a, b in (corners[:2], corners[2:])]
-        srgb = rows[0] + ty[:, None] * (rows[1] - rows[0])
-        return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+        return texture, np.clip(uv, -MAX_UV, MAX_UV)
 
-    def texture(self, number: int) -> np.ndarray | None:
-        """Return the pixels of a texture, shape ``(H, W, 3)`` uint8; None, and a note, where it cannot be read."""
-        try:
-            from PIL import Image
-        except ImportError:
-            self.notes.append(f"textures are left out, for want of Pillow: {install_command('render')}")
-            return None
+    def texture(self, number: int) -> Texture | None:
+        """Return a texture; None, and a note, where it cannot be read."""
         entry = self.gltf.item("textures", number)
         source = ((entry.get("extensions") or {}).get("EXT_texture_webp") or entry).get("source")
         if source is None:
             self.notes.append(f"texture {number} is in a format that is not read: its surfaces have plain colours")
             return None
+        sampler = entry.get("sampler")
+        wraps = {} if sampler is None else self.gltf.item("samplers", sampler)
+        if source not in self._images:
+            self._images[source] = self.image(source, number)
+        pixels = self._images[source]
+        across, down = (wraps.get(key, REPEAT) for key in ("wrapS", "wrapT"))
+        known = (REPEAT, CLAMP, MIRROR)
+        if pixels is None:
+            return None
+        return Texture(pixels, (across if across in known else REPEAT, down if down in known else REPEAT))
+
+    def image(self, source: int, number: int) -> np.ndarray | None:
+        """Return the pixels of the image of a texture, ``(H, W, 3)`` uint8; None, and a note, where it is not read."""
         image = self.gltf.item("images", source)
         what = f"image {source}"
         try:
+            if len(self._images) >= MAX_IMAGES:
+                raise ValueError(f"the file has more than {MAX_IMAGES} images of base colours")
             content = (
                 self.gltf.resource(image["uri"], what)
                 if "uri" in image
                 else self.gltf.buffer_view(image["bufferView"], what)
             )
-            with Image.open(io.BytesIO(content)) as picture:
-                if picture.width * picture.height > MAX_PIXELS:
-                    raise ValueError(f"it has {picture.width} x {picture.height} pixels, more than {MAX_PIXELS}")
-                picture = picture.convert("RGB")
-                picture.thumbnail((TEXTURE_SIDE, TEXTURE_SIDE))
-                return np.asarray(picture)
-        except (*UNREADABLE, Image.DecompressionBombError) as error:
+            return decoded(content)
+        except ImportError:
+            self.notes.append(f"textures are left out, for want of Pillow: {install_command('render')}")
+        except UNREADABLE as error:
             self.notes.append(f"texture {number} is left out: {first_line(error)}")
-            return None
-
-
-def _neighbours(at: np.ndarray, size: int, wrap: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the two pixels beside each coordinate in [0, 1], and how far it is to the second."""
-    place = at * size - 0.5
-    first = np.floor(np.clip(place, -1e9, 1e9)).astype(np.int64)
-    share = place - first
-
-    def inside(pixel: np.ndarray) -> np.ndarray:
-        if wrap == _CLAMP:
-            return np.clip(pixel, 0, size - 1)
-        if wrap == _MIRROR:
-            folded = pixel % (2 * size)
-            return np.where(folded < size, folded, 2 * size - 1 - folded)
-        return pixel % size
-
-    return inside(first), inside(first + 1), share
+        return None

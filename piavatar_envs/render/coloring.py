@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.cluster.vq import kmeans2, vq
 
+from piavatar_envs.core.srgb import linear_to_srgb
 from piavatar_envs.render.scene import Body, Color
 
 _TABLE_SIZE = 256
@@ -57,18 +58,6 @@ def strain_color(values: ArrayLike, maximum: float) -> np.ndarray:
         raise ValueError(f"maximum={maximum} must be positive: it is the value of the last colour")
     position = np.nan_to_num(np.asarray(values, dtype=np.float64) / maximum, nan=1.0)
     return np.rint(np.clip(position, 0.0, 1.0) * (_TABLE_SIZE - 1)).astype(np.int64)
-
-
-def srgb_to_linear(color: ArrayLike) -> np.ndarray:
-    """Light intensities of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    color = np.asarray(color, dtype=np.float64)
-    return np.where(color <= 0.04045, color / 12.92, ((np.maximum(color, 0.0) + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(light: ArrayLike) -> np.ndarray:
-    """Convert light intensities to sRGB in [0, 1], clipped (IEC 61966-2-1)."""
-    light = np.clip(np.asarray(light, dtype=np.float64), 0.0, 1.0)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
 
 
 def oklab_to_srgb(lab: ArrayLike) -> np.ndarray:

@@ -7,11 +7,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from piavatar_envs.avatar.body.textures import Textures
 from piavatar_envs.render.coloring import color_by
 from piavatar_envs.render.scene import Body, Marker, Scene, Solid
 
 #: Begin of the names of bodies.
 _BODY = "body_"
+#: Name or place of a mesh, its vertices, triangles, colours of the vertices, and textures.
+Named = tuple[str, np.ndarray, np.ndarray, np.ndarray, Textures | None]
 
 
 @dataclass(eq=False)
@@ -23,12 +26,14 @@ class Moving:
         faces: outward oriented triangles, shape ``(T, 3)`` int.
         shapes: vertices [m] in each frame, shape ``(V, 3)`` float32, or None where it is not there.
         colors: sRGB of the vertices in each frame, shape ``(V, 3)`` uint8; equal ones are the same array.
+        textures: of the base colour, of which these are the colours at the vertices; None without any.
     """
 
     name: str
     faces: np.ndarray
     shapes: list[np.ndarray | None] = field(default_factory=list)
     colors: list[np.ndarray | None] = field(default_factory=list)
+    textures: Textures | None = None
 
     @property
     def first(self) -> int:
@@ -81,8 +86,8 @@ class Film:
 
     def add(self, scene: Scene) -> None:
         """Append a frame."""
-        for name, vertices, faces, color in self._names.meshes(scene):
-            mesh = self._meshes.setdefault(name, Moving(name, np.asarray(faces)))
+        for name, vertices, faces, color, textures in self._names.meshes(scene):
+            mesh = self._meshes.setdefault(name, Moving(name, np.asarray(faces), textures=textures))
             mesh.append(self.num_frames, vertices, color)
         self.num_frames += 1
 
@@ -107,9 +112,9 @@ class Names:
         """Begin without names."""
         self._known: dict[tuple[str, int, bytes, bytes], str] = {}
 
-    def meshes(self, scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield name, vertices, triangles and colours (sRGB, uint8) of everything in the next scene."""
-        for place, vertices, faces, color in _meshes(scene):
+    def meshes(self, scene: Scene) -> Iterator[Named]:
+        """Yield name, vertices, triangles, colours (sRGB, uint8) and textures of everything in the next scene."""
+        for place, vertices, faces, color, textures in _meshes(scene):
             fixed = b"" if place.startswith(_BODY) else color.tobytes()
             key = (place, len(vertices), np.ascontiguousarray(faces).tobytes(), fixed)
             if key not in self._known:
@@ -117,19 +122,20 @@ class Names:
                 self._known[key] = f"{place}_{others}" if others else place
             # programs would not read what a failed simulation has
             vertices = np.nan_to_num(np.asarray(vertices, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-            yield self._known[key], vertices, faces, color
+            yield self._known[key], vertices, faces, color, textures
 
 
-def _meshes(scene: Scene) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield place in the scene, vertices, triangles and colours of everything in it."""
+def _meshes(scene: Scene) -> Iterator[Named]:
+    """Yield place in the scene, vertices, triangles, colours and textures of everything in it."""
     for index, body in enumerate(scene.bodies):
-        yield f"{_BODY}{index}", body.vertices, body.faces, _colors_of(body)
+        textures = body.textures if body.scalars is None else None
+        yield f"{_BODY}{index}", body.vertices, body.faces, _colors_of(body), textures
     for index, marker in enumerate(scene.markers):
         vertices, faces = marker.mesh()
         kind, number = type(marker).__name__.lower(), index
         if isinstance(marker, Solid):
             kind, number = marker.kind, marker.number
-        yield f"{kind}_{number}", vertices, faces, _colors_of(marker, len(vertices))
+        yield f"{kind}_{number}", vertices, faces, _colors_of(marker, len(vertices)), None
 
 
 def _colors_of(thing: Body | Marker, count: int = 0) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -17,8 +18,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from piavatar_envs.avatar.body.splat_files import write_ply
+from piavatar_envs.avatar.body.textures import Texture, encoded
 from piavatar_envs.core.extras import missing
-from piavatar_envs.render.coloring import srgb_to_linear
+from piavatar_envs.core.srgb import srgb_to_linear
 from piavatar_envs.render.film import Film, Moving, Names
 from piavatar_envs.render.scene import Scene
 
@@ -86,28 +88,51 @@ class _Glb:
             "bufferViews": [],
         }
         self._content: list[bytes] = []
+        self._materials: dict[int, int] = {}  # by identity of the texture
         self.size = 0
 
     def add(self, values: np.ndarray, component: int, target: int | None = None, **more: Any) -> int:
-        """Append an accessor of rows of 1, 3 or 4 numbers, and return its index."""
+        """Append an accessor of rows of 1 to 4 numbers, and return its index."""
         values = np.ascontiguousarray(values)
-        content = values.tobytes()
-        view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content)}
-        if target is not None:
-            view["target"] = target
-        self.size += len(content)
-        self._content.append(content)
-        self.document["bufferViews"].append(view)
+        view = self._add_view(values.tobytes(), **({} if target is None else {"target": target}))
         width = 1 if values.ndim == 1 else values.shape[1]
-        accessor = {"bufferView": len(self.document["bufferViews"]) - 1, "componentType": component}
-        accessor |= {"count": len(values), "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[width], **more}
-        self.document["accessors"].append(accessor)
-        return len(self.document["accessors"]) - 1
+        accessor = {"bufferView": view, "componentType": component}
+        accessor |= {"count": len(values), "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[width], **more}
+        return self._append("accessors", accessor)
 
     def add_points(self, points: np.ndarray) -> int:
         """Append positions or displacements, with the bounds that these must have."""
         bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
         return self.add(points, _FLOAT, _ARRAYS, **bounds)
+
+    def add_material(self, texture: Texture) -> int | None:
+        """Append a material with a texture, once, and return its index; None without Pillow, which writes images."""
+        if find_spec("PIL") is None:
+            return None
+        if id(texture) not in self._materials:
+            view = self._add_view(encoded(texture.pixels))
+            wraps = dict(zip(("wrapS", "wrapT"), texture.wraps, strict=True))
+            source = {
+                "source": self._append("images", {"bufferView": view, "mimeType": "image/png"}),
+                "sampler": self._append("samplers", wraps),
+            }
+            base = {"baseColorTexture": {"index": self._append("textures", source)}}
+            plain = self.document["materials"][0]["pbrMetallicRoughness"]
+            self._materials[id(texture)] = self._append("materials", {"pbrMetallicRoughness": plain | base})
+        return self._materials[id(texture)]
+
+    def _append(self, key: str, item: dict[str, Any]) -> int:
+        """Append to a list of the document, and return the index."""
+        self.document.setdefault(key, []).append(item)
+        return len(self.document[key]) - 1
+
+    def _add_view(self, content: bytes, **more: Any) -> int:
+        """Append a part of the buffer, of whole words, and return its index."""
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content), **more}
+        content += b"\0" * (-len(content) % 4)
+        self.size += len(content)
+        self._content.append(content)
+        return self._append("bufferViews", view)
 
     def write(self, path: Path) -> None:
         """Write the file: the two chunks, of whole words (section 4.4)."""
@@ -124,6 +149,8 @@ class _Glb:
 def write_glb(film: Film, folder: Path) -> Path:
     """Write ``film.glb`` and return its path; raises as :meth:`WholeWriter.finish`."""
     needed = sum(24 * len(shape) for mesh in film.meshes for shape in mesh.shapes if shape is not None)
+    images = {id(image): image.pixels.nbytes for m in film.meshes if m.textures for image in m.textures.images}
+    needed += sum(images.values())
     if needed > MAX_GLB:
         raise ValueError(f"a glTF file of {film.num_frames} frames has {needed:.1e} bytes, 2^31 at most; export fewer")
     if any(mesh.repaints for mesh in film.meshes):
@@ -165,27 +192,47 @@ def _add_mesh(glb: _Glb, mesh: Moving) -> np.ndarray:
     changed = np.array([False, *(not np.array_equal(a, b) for a, b in pairwise(shapes))])
     number = np.cumsum(changed)
     base, normals = _y_up(shapes[0]), _y_up(_normals(shapes[0], mesh.faces))
+    parts, tints = _materials_of(glb, mesh)
     light = np.ones((len(base), 4))
-    light[:, :3] = srgb_to_linear(mesh.colors[mesh.first] / 255.0)
+    light[:, :3] = srgb_to_linear(tints / 255.0)
     attributes = {
         "POSITION": glb.add_points(base),
         "NORMAL": glb.add(normals, _FLOAT, _ARRAYS),
         "COLOR_0": glb.add(np.rint(65535.0 * light).astype("<u2"), _UINT16, _ARRAYS, normalized=True),
     }
-    indices = glb.add(mesh.faces.astype("<u4").ravel(), _UINT32, _INDICES)
-    primitive: dict[str, Any] = {"attributes": attributes, "indices": indices, "material": 0}
+    if any(material for material, _ in parts):
+        attributes["TEXCOORD_0"] = glb.add(mesh.textures.uv.astype("<f4"), _FLOAT, _ARRAYS)
+    primitives: list[dict[str, Any]] = []
+    for material, own in parts:
+        indices = glb.add(mesh.faces[own].astype("<u4").ravel(), _UINT32, _INDICES)
+        primitives.append({"attributes": attributes, "indices": indices, "material": material})
     targets = []
     for frame in np.flatnonzero(changed):
         shape = shapes[frame]
         normal = _y_up(_normals(shape, mesh.faces)) - normals
         targets.append({"POSITION": glb.add_points(_y_up(shape) - base), "NORMAL": glb.add(normal, _FLOAT, _ARRAYS)})
-    entry: dict[str, Any] = {"name": mesh.name, "primitives": [primitive]}
+    entry: dict[str, Any] = {"name": mesh.name, "primitives": primitives}
     if targets:
-        primitive["targets"] = targets
+        for primitive in primitives:
+            primitive["targets"] = targets
         entry["weights"] = [0.0] * len(targets)
         entry["extras"] = {"targetNames": [f"frame_{frame:04d}" for frame in np.flatnonzero(changed)]}
     glb.document["meshes"].append(entry)
     return (number[:, None] == 1 + np.arange(len(targets))).astype(np.float32)
+
+
+def _materials_of(glb: _Glb, mesh: Moving) -> tuple[list[tuple[int, np.ndarray | slice]], np.ndarray]:
+    """Return the materials of a mesh with the triangles of each, and the colours of the vertices that go with them."""
+    textures, plain = mesh.textures, ([(0, slice(None))], mesh.colors[mesh.first])
+    if textures is None:
+        return plain
+    parts = []
+    for index in np.unique(textures.image):
+        material = 0 if index < 0 else glb.add_material(textures.images[index])
+        if material is None:
+            return plain
+        parts.append((material, textures.image == index))
+    return parts, textures.tints
 
 
 def _y_up(vectors: np.ndarray) -> np.ndarray:
@@ -243,7 +290,7 @@ class PlyWriter:
         Raises:
             OSError: the folder cannot be written.
         """
-        for name, vertices, faces, colors in self._names.meshes(scene):
+        for name, vertices, faces, colors, _ in self._names.meshes(scene):
             write_mesh_ply(self._file(name), vertices, faces, colors)
         for index, body in enumerate(scene.bodies):
             if body.splats is not None:

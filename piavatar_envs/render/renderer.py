@@ -11,10 +11,12 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.splats import joined_colors
+from piavatar_envs.avatar.body.textures import Textures
 from piavatar_envs.core.capture_lock import CAPTURE
 from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.render.coloring import srgb_to_linear, strain_color, strain_table
+from piavatar_envs.core.srgb import srgb_to_linear
+from piavatar_envs.render.coloring import strain_color, strain_table
 from piavatar_envs.render.overlay import draw_scale
 from piavatar_envs.render.painter import GREATEST_SIDE, Painter
 from piavatar_envs.render.scene import Body, Camera, Follower, Marker, MovedSplats
@@ -107,17 +109,18 @@ class Renderer:
             ]
         )
         splats = [body.splats for body in bodies if body.splats is not None]
+        textures = [_textures(body) for body in bodies]
         clouds = tuple((id(each.cloud), each.colors is None) for each in splats)
-        key = (tuple((id(faces), len(own)) for own, faces in meshes), clouds)
+        key = (tuple((id(faces), len(own)) for own, faces in meshes), clouds, tuple(id(each) for each in textures))
         # A picture that is interrupted leaves samples behind: its painter is not used again.
         shown, self._shown = self._shown, None
         if shown is None or shown.key != key:
             parts = [MeshPart(len(own), faces) for own, faces in meshes]
             for index, body in enumerate(bodies):
-                parts[index] = replace(parts[index], is_drawn=body.splats is None)
+                parts[index] = replace(parts[index], is_drawn=body.splats is None, textures=_textures(body))
             with CAPTURE.exclusive():
                 painter = Painter(Surfaces.build(parts, self._device), 1, self.height, self.width, self._device)
-                shown = _Shown(key, [mesh[1] for mesh in meshes], splats, painter)
+                shown = _Shown(key, [*(mesh[1] for mesh in meshes), *textures], splats, painter)
         with CAPTURE.shared():
             picture = shown.draw(vertices, albedo, splats, shot)
         self._shown = shown
@@ -152,12 +155,10 @@ class _Shown:
     The launches are made one by one, because a captured graph would exclude other threads while it is captured.
     """
 
-    def __init__(
-        self, key: tuple, faces: Sequence[np.ndarray], splats: Sequence[MovedSplats], painter: Painter
-    ) -> None:
+    def __init__(self, key: tuple, owners: Sequence[object], splats: Sequence[MovedSplats], painter: Painter) -> None:
         self.key, self._painter = key, painter
         clouds = [each.cloud for each in splats]
-        self._owners = faces, clouds  # an id is only unique while its owner lives
+        self._owners = owners, clouds  # an id is only unique while its owner lives
         self._splats: SplatPainter | None = None
         if clouds:
             size, opacities = (1, painter.height, painter.width), np.concatenate([each.opacities for each in clouds])
@@ -184,6 +185,11 @@ class _Shown:
         return painter.picture.numpy()[0].copy()
 
 
+def _textures(body: Body) -> Textures | None:
+    """Return the textures that a body is drawn with."""
+    return None if body.scalars is not None else body.textures
+
+
 def _body_albedo(body: Body) -> np.ndarray:
     """Return the linear light that the vertices of a body reflect, shape ``(V, 3)``."""
     count = len(body.vertices)
@@ -193,6 +199,8 @@ def _body_albedo(body: Body) -> np.ndarray:
         return _linear_strain_table()[strain_color(body.scalars, body.scalar_max)]
     if body.colors is not None and np.shape(body.colors) != (count, 3):
         raise ValueError(f"colors have shape {np.shape(body.colors)}; give a row a vertex: {count}")
+    if body.textures is not None:
+        return linear_albedo(body.textures.tints)
     return np.broadcast_to(linear_albedo(body.color if body.colors is None else body.colors), (count, 3))
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.body import textures
 from piavatar_envs.render.ground import Ground, checker, ground_at, ground_share
 from piavatar_envs.render.shading import to_srgb
 from piavatar_envs.render.shadows import Grids, opacity_at
 from piavatar_envs.render.views import View, ray_at, rays_of
 
 wp.set_module_options({"enable_backward": False})
+
+CLAMP, MIRROR = wp.constant(textures.CLAMP), wp.constant(textures.MIRROR)
 
 
 @wp.struct
@@ -19,7 +22,9 @@ class Paint:
     uv: wp.array[wp.vec2]
     texture: wp.array[int]
     texels: wp.array3d[wp.uint8]
+    wraps: wp.array2d[int]
     texture_size: int
+    albedo: wp.array2d[wp.vec3]
     subject: wp.array[int]
 
 
@@ -36,6 +41,17 @@ def texel_at(texels: wp.array3d[wp.uint8], texture: int, cell: int) -> wp.vec3:
 
 
 @wp.func
+def wrapped(cell: int, size: int, wrap: int) -> int:
+    """Return the row or column of a texture, of a power of two of them, that is shown where it may be beyond."""
+    if wrap == CLAMP:
+        return wp.clamp(cell, 0, size - 1)
+    if wrap == MIRROR:
+        folded = cell & (2 * size - 1)
+        return wp.min(folded, 2 * size - 1 - folded)
+    return cell & (size - 1)
+
+
+@wp.func
 def textured(paint: Paint, texture: int, uv: wp.vec2, texels_a_pixel: float) -> wp.vec3:
     """Return the linear base colour of a texture between the texels of the level that fits the pixels."""
     size = int(paint.texture_size)
@@ -49,10 +65,12 @@ def textured(paint: Paint, texture: int, uv: wp.vec2, texels_a_pixel: float) -> 
     row = int(wp.floor(y))
     fx = x - float(column)
     fy = y - float(row)
-    left = column & (size - 1)
-    right = (column + 1) & (size - 1)
-    top = first + (row & (size - 1)) * size
-    bottom = first + ((row + 1) & (size - 1)) * size
+    across = paint.wraps[texture, 0]
+    down = paint.wraps[texture, 1]
+    left = wrapped(column, size, across)
+    right = wrapped(column + 1, size, across)
+    top = first + wrapped(row, size, down) * size
+    bottom = first + wrapped(row + 1, size, down) * size
     color = (1.0 - fy) * (
         (1.0 - fx) * texel_at(paint.texels, texture, top + left) + fx * texel_at(paint.texels, texture, top + right)
     ) + fy * (
@@ -84,9 +102,9 @@ def weights_of(eye: wp.vec3, ray: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -
 @wp.func
 def shade_texture(
     view: View, paint: Paint, texture: int, corner: wp.vec3i, a: wp.vec3, b: wp.vec3, c: wp.vec3, weights: wp.vec3,
-    light: wp.vec4,
+    tint: wp.vec3, light: wp.vec4,
 ) -> wp.vec3:  # fmt: skip
-    """Return the sRGB colour that a textured triangle shows where its corners have these weights."""
+    """Return the sRGB colour that a textured triangle of a tint shows where its corners have these weights."""
     uv_a = paint.uv[corner[0]]
     uv_b = paint.uv[corner[1]]
     uv_c = paint.uv[corner[2]]
@@ -98,7 +116,7 @@ def shade_texture(
     of_texels = wp.abs(u[0] * v[1] - u[1] * v[0]) * size * size
     of_pixels = view.focal * view.focal * wp.abs(wp.dot(wp.cross(b - a, c - a), at)) / (depth * depth * depth)
     uv = weights[0] * uv_a + weights[1] * uv_b + weights[2] * uv_c
-    albedo = textured(paint, texture, uv, of_texels / wp.max(of_pixels, 1.0e-9))
+    albedo = wp.cw_mul(tint, textured(paint, texture, uv, of_texels / wp.max(of_pixels, 1.0e-9)))
     return wp.vec3(
         to_srgb(albedo[0] * light[0] + light[3]),
         to_srgb(albedo[1] * light[1] + light[3]),
@@ -216,7 +234,13 @@ def resolve(
                     + weights[1] * light[c, corner[1]]
                     + weights[2] * light[c, corner[2]]
                 )
-                seen = shade_texture(view, paint, texture, corner, p, q, r, weights, own_light)
+                a = wp.min(n, paint.albedo.shape[0] - 1)
+                tint = (
+                    weights[0] * paint.albedo[a, corner[0]]
+                    + weights[1] * paint.albedo[a, corner[1]]
+                    + weights[2] * paint.albedo[a, corner[2]]
+                )
+                seen = shade_texture(view, paint, texture, corner, p, q, r, weights, tint, own_light)
             total += float(count) * seen
             missing -= count
         if greatest != wp.uint64(0):

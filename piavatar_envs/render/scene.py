@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.splats import SplatCloud, constant_colors
+from piavatar_envs.avatar.body.textures import Textures
 from piavatar_envs.render.markers import placed_mesh, turn_to_direction
 from piavatar_envs.sim.markers import TARGET, WIRE
 
@@ -74,6 +75,8 @@ class Body:
         scalar_max: the value of the last colour; the range is ``[0, scalar_max]``, the same in every frame.
         scalar_label: title of the colour scale.
         splats: what is drawn instead of the mesh, which then casts shadows only; they have their own colours.
+        textures: of the base colour, drawn in place of ``colors``, which the live view has, where there are no scalars.
+            Pass the same object every frame.
     """
 
     vertices: np.ndarray
@@ -84,6 +87,7 @@ class Body:
     scalar_max: float = 0.3
     scalar_label: str = "max |stretch - 1|"
     splats: MovedSplats | None = None
+    textures: Textures | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.body.textures import Textures
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.markers import MarkerMeshes, place_markers, unit_mesh, upload_meshes
@@ -49,6 +50,7 @@ class Part:
         faces: triangles, counted from its first vertex, shape ``(T, 3)`` int32.
         color: sRGB in [0, 1].
         colors: sRGB of the vertices instead, shape ``(V, 3)`` uint8.
+        textures: of the base colour instead, where a view has them.
         subject: its label, an index into :attr:`Stage.subjects`.
     """
 
@@ -58,6 +60,7 @@ class Part:
     faces: np.ndarray
     color: Color
     colors: np.ndarray | None
+    textures: Textures | None
     subject: int
 
     @property
@@ -125,7 +128,7 @@ class Stage:
         meshes = []
         for index, part in enumerate(self.parts):
             drawn = self.splats is None or index not in self.splats.bound
-            given = part.num_vertices, part.faces, part.color, part.colors
+            given = part.num_vertices, part.faces, part.color, part.colors, part.textures
             meshes.append(MeshPart(*given, subject=part.subject, is_drawn=drawn))
         return Surfaces.build(meshes, self.device)
 
@@ -158,7 +161,8 @@ class Stage:
         for index, flesh in enumerate(simulation.flesh):
             drawn = flesh.asset.drawn
             color = PALETTE[index % len(PALETTE)]
-            self._add(names[index], "avatar", len(drawn.vertices), drawn.faces, color, drawn.colors_of(index))
+            given = len(drawn.vertices), drawn.faces, color, drawn.colors_of(index), drawn.textures
+            self._add(names[index], "avatar", *given)
         for name, solid in zip(names[avatars:], self.solids, strict=True):
             self._add(name, "prop", len(solid.vertices), solid.faces, PROP)
         for collider in self._colliders:
@@ -170,12 +174,13 @@ class Stage:
             self._add(MARKERS, spec.kind, len(local), faces, spec.color)
 
     def _add(
-        self, name: str, kind: str, count: int, faces: np.ndarray, color: Color, colors: np.ndarray | None = None
-    ) -> None:
+        self, name: str, kind: str, count: int, faces: np.ndarray, color: Color, colors: np.ndarray | None = None,
+        textures: Textures | None = None,
+    ) -> None:  # fmt: skip
         """Append a part."""
         first = self.parts[-1].vertices.stop if self.parts else 0
         subject = self.subjects.index(name, 1)
-        self.parts.append(Part(name, kind, slice(first, first + count), faces, color, colors, subject))
+        self.parts.append(Part(name, kind, slice(first, first + count), faces, color, colors, textures, subject))
 
     def record(self, graph: LaunchGraph) -> None:
         """Append the launches that write the vertices of all pictures from the present state."""

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from piavatar_envs.render.coloring import srgb_to_linear
+from piavatar_envs.avatar.body.textures import REPEAT, TEXTURE_SIDE, Textures, joined
+from piavatar_envs.core.srgb import srgb_to_linear
 from piavatar_envs.render.scene import CLAY, Color
 
-#: Largest side of a texture on the device [texels]; larger images are reduced.
-MOST_TEXELS = 1024
+#: Memory of all textures on the device [bytes], which are reduced until they fit: 32 of the largest side do.
+_MOST_BYTES = 2**27
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +25,7 @@ class MeshPart:
         faces: outward oriented triangles, shape ``(T, 3)`` int; only their fronts are drawn.
         color: sRGB in [0, 1] of all of it.
         colors: sRGB of the vertices instead, shape ``(V, 3)`` uint8.
-        texture: sRGB image of the base colour instead, shape ``(h, w, 3)`` uint8.
-        uv: place of the vertices in the image, from its upper left corner (0, 0) to its lower right (1, 1), repeated
-            beyond, shape ``(V, 2)``; needed with a texture.
+        textures: of the base colour instead.
         subject: label of its pixels in a segmentation, from 1 to 255; 0 is the ground and the sky.
         is_drawn: whether it is seen; it casts shadows in either case, such as those of splats that are drawn instead.
     """
@@ -35,8 +34,7 @@ class MeshPart:
     faces: np.ndarray
     color: Color = CLAY
     colors: np.ndarray | None = None
-    texture: np.ndarray | None = None
-    uv: np.ndarray | None = None
+    textures: Textures | None = None
     subject: int = 1
     is_drawn: bool = True
 
@@ -44,8 +42,14 @@ class MeshPart:
         shape = (self.num_vertices, 3)
         if self.colors is not None and np.shape(self.colors) != shape:
             raise ValueError(f"colors have shape {np.shape(self.colors)}; give a row a vertex: {self.num_vertices}")
-        if self.texture is not None and np.shape(self.uv) != (self.num_vertices, 2):
-            raise ValueError(f"a texture needs uv of shape {(self.num_vertices, 2)}; got {np.shape(self.uv)}")
+        if self.textures is not None and (len(self.textures.uv), len(self.textures.image)) != (
+            self.num_vertices,
+            len(self.faces),
+        ):
+            raise ValueError(
+                f"textures have uv of {len(self.textures.uv)} vertices and images of {len(self.textures.image)} "
+                f"triangles; the mesh has {self.num_vertices} and {len(self.faces)}"
+            )
         if not 0 <= self.subject <= 255:
             raise ValueError(f"subject={self.subject} is outside [0, 255]: a label is one byte")
 
@@ -63,11 +67,12 @@ class Surfaces:
         incident: triangles of every vertex, ascending.
         neighbour_offsets: first entry of each vertex in :attr:`neighbours`, shape ``(V + 1,)``.
         neighbours: vertices that share an edge with every vertex, ascending.
-        albedo: linear light in [0, 1] that each vertex reflects, shape ``(1, V)``, or ``(N, V)`` with a row a picture;
-            may be rewritten at any time.
+        albedo: linear light in [0, 1] that each vertex reflects, times its texture if it has one, shape ``(1, V)``, or
+            ``(N, V)`` with a row a picture; may be rewritten at any time.
         uv: place of each vertex in its texture, shape ``(V,)``.
         texture: texture of each triangle, -1 without one, shape ``(T,)``.
         texels: textures with all their reduced levels, from the full size to one texel, sRGB, shape ``(K, n, 3)``.
+        wraps: how each texture goes on beyond its borders, see :class:`Texture`, shape ``(K, 2)``.
         texture_size: side of the textures [texels], a power of two.
         subject: label of each triangle, -1 of one that is not drawn, shape ``(T,)``.
     """
@@ -82,6 +87,7 @@ class Surfaces:
     uv: wp.array
     texture: wp.array
     texels: wp.array
+    wraps: wp.array
     texture_size: int
     subject: wp.array
 
@@ -110,21 +116,21 @@ class Surfaces:
                 )
             faces.append(own + offset)
         triangles = np.concatenate(faces)
-        images = [mesh.texture for mesh in meshes if mesh.texture is not None]
-        size = _side(images)
-        labels, textures, found = [], [], 0
-        for mesh, own in zip(meshes, faces, strict=True):
-            labels.append(np.full(len(own), mesh.subject if mesh.is_drawn else -1))
-            textures.append(np.full(len(own), found if mesh.texture is not None else -1))
-            found += mesh.texture is not None
-        uv = [np.zeros((mesh.num_vertices, 2)) if mesh.uv is None else np.asarray(mesh.uv) for mesh in meshes]
-        albedo = [
-            np.broadcast_to(linear_albedo(mesh.color if mesh.colors is None else mesh.colors), (mesh.num_vertices, 3))
-            for mesh in meshes
+        labels = [
+            np.full(len(own), mesh.subject if mesh.is_drawn else -1) for mesh, own in zip(meshes, faces, strict=True)
         ]
+        albedo = [np.broadcast_to(linear_albedo(_plain(mesh)), (mesh.num_vertices, 3)) for mesh in meshes]
+        # an avatar that is there twice has its images once; without textures, one that no triangle has
+        no_colors = (np.zeros((mesh.num_vertices, 3), np.uint8) for mesh in meshes)
+        textures = joined(
+            [(mesh.textures, none, len(own)) for mesh, none, own in zip(meshes, no_colors, faces, strict=True)]
+        ) or Textures((), np.full(len(triangles), -1), np.zeros((first[-1], 2)), np.zeros((first[-1], 3)))
+        images = [texture.pixels for texture in textures.images] or [np.zeros((1, 1, 3), np.uint8)]
+        size = _side(images)
         incident = _incident(triangles, int(first[-1]))
         neighbours = _neighbours(triangles, int(first[-1]))
-        texels = np.stack([_levels(_resized(image, size)) for image in images] or [np.zeros((1, 3), np.uint8)])
+        texels = np.stack([_levels(_resized(image, size)) for image in images])
+        wraps = np.array([texture.wraps for texture in textures.images] or [(REPEAT, REPEAT)], np.int32)
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:
             # Kernels take no empty arrays.
@@ -139,12 +145,20 @@ class Surfaces:
             neighbour_offsets=upload(neighbours[0], wp.int32),
             neighbours=upload(neighbours[1], wp.int32),
             albedo=wp.array(np.tile(np.concatenate(albedo), (num_albedos, 1, 1)), dtype=wp.vec3, device=device),
-            uv=upload(np.concatenate(uv).astype(np.float32), wp.vec2),
-            texture=upload(np.concatenate(textures).astype(np.int32), wp.int32),
+            uv=upload(textures.uv.astype(np.float32), wp.vec2),
+            texture=upload(textures.image.astype(np.int32), wp.int32),
             texels=upload(texels, wp.uint8),
+            wraps=upload(wraps, wp.int32),
             texture_size=size,
             subject=upload(np.concatenate(labels).astype(np.int32), wp.int32),
         )
+
+
+def _plain(mesh: MeshPart) -> Color | np.ndarray:
+    """Return the colour of a mesh but for its textures, or those of its vertices."""
+    if mesh.textures is not None:
+        return mesh.textures.tints
+    return mesh.color if mesh.colors is None else mesh.colors
 
 
 def linear_albedo(color: Color | np.ndarray) -> np.ndarray:
@@ -175,9 +189,12 @@ def _neighbours(triangles: np.ndarray, num_vertices: int) -> tuple[np.ndarray, n
 
 
 def _side(images: Sequence[np.ndarray]) -> int:
-    """Return the side of the textures on the device: a power of two that holds the largest image, within the limit."""
-    largest = max((max(image.shape[:2]) for image in images), default=1)
-    return min(MOST_TEXELS, 1 << int(np.ceil(np.log2(max(largest, 1)))))
+    """Return the side of the textures on the device: a power of two that holds the largest image, within the limits."""
+    largest = max(max(image.shape[:2]) for image in images)
+    side = min(TEXTURE_SIDE, 1 << int(np.ceil(np.log2(max(largest, 1)))))
+    while side > 1 and 4 * side * side * len(images) > _MOST_BYTES:
+        side //= 2
+    return side
 
 
 def _resized(image: np.ndarray, size: int) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gymnasium
 import numpy as np
 import pytest
@@ -9,7 +11,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, GrayscaleObservation, NormalizeObservation
 from gymnasium.wrappers import vector as vector_wrappers
 
+import piavatar_envs
 from piavatar_envs.api.conformance import check_task
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.body.textures import Texture, Textures
 from piavatar_envs.config import PixelsConfig
 from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks import task_modules
@@ -53,6 +58,25 @@ def test_depth_and_labels_are_in_their_space(make_env):
         assert 0.0 < seen["depth"].min() < 5.0 and seen["depth"].max() <= 6.0
         assert {0, 1} <= set(seen["segmentation"].ravel())
         assert seen["depth"][seen["segmentation"] == 1].max() < 6.0, "the body is nearer than the sky"
+
+
+def test_avatars_are_seen_in_their_textures(make_env):
+    """A look in a red image, of which the colours at the vertices are green."""
+    asset = load_asset()
+    look, red = asset.drawn, np.full((4, 4, 3), (230, 10, 10), np.uint8)
+    count = len(look.vertices)
+    uv, white = np.full((count, 2), 0.5, np.float32), np.full((count, 3), 255, np.uint8)
+    textures = Textures((Texture(red),), np.zeros(len(look.faces), np.int32), uv, white)
+    green = np.full((count, 3), (10, 230, 10), np.uint8)
+    asset = dataclasses.replace(asset, look=dataclasses.replace(look, colors=green, textures=textures))
+    piavatar_envs.register_source("red", lambda: asset)
+    env = make_env("PIAvatar/Stand-v0", **ALL, avatar={"source": "red"}, render_mode="rgb_array")
+    seen = env.reset(seed=0)[0]
+    body = seen["pixels"][seen["segmentation"][..., 0] == 1].astype(int)
+    assert len(body) > 10 and np.median(body[:, 0] - body[:, 1]) > 100
+    for picture, share in ((seen["pixels"], 0.01), (env.render(), 0.005)):
+        far = picture[..., 0].astype(int) - picture[..., 1]
+        assert (far > 100).mean() > share and (far < -50).sum() == 0
 
 
 def test_every_environment_can_be_seen(make_env):

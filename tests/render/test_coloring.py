@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.core.srgb import srgb_to_linear
 from piavatar_envs.render import strain_magnitude
-from piavatar_envs.render.coloring import color_by, srgb_to_linear, strain_table
+from piavatar_envs.render.coloring import color_by, strain_table
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,11 @@ import sys
 import numpy as np
 import pytest
 
+from piavatar_envs.avatar.body.textures import CLAMP, MIRROR, REPEAT, Texture, Textures
 from piavatar_envs.avatar.gltf import read_gltf
-from piavatar_envs.render.coloring import color_by, linear_to_srgb
+from piavatar_envs.avatar.gltf_surfaces import read_surfaces
+from piavatar_envs.core.srgb import linear_to_srgb
+from piavatar_envs.render.coloring import color_by
 from piavatar_envs.render.film_files import film_writer
 from piavatar_envs.render.scene import Body, Box, Scene, Solid, Sphere
 
@@ -86,6 +89,34 @@ def test_gltf_keeps_colours_triangles_and_smooth_normals(tmp_path):
     radii = (gltf.accessor(primitive["attributes"]["POSITION"]) - center) / 0.1
     normals = gltf.accessor(primitive["attributes"]["NORMAL"])
     assert (np.einsum("vi,vi->v", normals, radii) > 0.97).all()
+
+
+def test_gltf_has_textures(tmp_path):
+    pytest.importorskip("PIL", reason="needs the extra render")
+    rng = np.random.default_rng(0)
+    images = tuple(
+        Texture(rng.integers(0, 255, (5, 7, 3)).astype(np.uint8), (CLAMP, wrap)) for wrap in (MIRROR, REPEAT)
+    )
+    uv = rng.uniform(-1.0, 2.0, (4, 2)).astype(np.float32)
+    textures = Textures(images, np.array([1, -1, 0, 1]), uv, COLORS)
+    (path,) = write(tmp_path, "glb", colors=textures.colors(FACES), textures=textures)
+    pieces = read_surfaces(read_gltf(path)).pieces[:3]
+    for piece, index in zip(pieces, (-1, 0, 1), strict=True):
+        own = FACES[textures.image == index]
+        np.testing.assert_allclose(z_up(piece.points)[piece.faces], shape(0)[own], atol=1e-6)
+        tints = COLORS[own]
+        if index < 0:
+            assert piece.textures is None
+            assert np.abs(piece.colors[piece.faces].astype(int) - tints).max() <= 1
+            continue
+        (image,) = piece.textures.images
+        assert np.array_equal(image.pixels, images[index].pixels) and image.wraps == images[index].wraps
+        np.testing.assert_allclose(piece.textures.uv[piece.faces], uv[own], atol=1e-6)
+        assert np.abs(piece.textures.tints[piece.faces].astype(int) - tints).max() <= 1
+    positions, _ = played(read_gltf(path), 0)  # all parts of a mesh have the same targets
+    np.testing.assert_allclose(positions, [shape(frame) for frame in range(FRAMES)], atol=1e-5)
+    primitives = read_gltf(path).json["meshes"][0]["primitives"]
+    assert all(part["targets"] == primitives[0]["targets"] for part in primitives)
 
 
 def test_ply_has_a_file_for_each_mesh_and_frame(tmp_path):

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from piavatar_envs.avatar.body.textures import CLAMP, MIRROR, REPEAT, Texture, Textures
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.srgb import srgb_to_linear
 from piavatar_envs.render import Box, Capsule, Sphere
 from piavatar_envs.render.ground import GroundStyle
 from piavatar_envs.render.painter import Painter
@@ -215,7 +217,7 @@ def test_a_texture_is_the_right_way_round_and_is_averaged_where_it_is_fine(devic
     corners, faces, uv = quad()
     image = np.zeros((8, 8, 3), np.uint8)
     image[:4, :4], image[:4, 4:], image[4:, :4] = (255, 0, 0), (0, 255, 0), (0, 0, 255)
-    painter = paint(device, [(corners, faces, {"texture": image, "uv": uv})], ground=NIGHT)
+    painter = paint(device, [(corners, faces, {"textures": on_all(faces, uv, image)})], ground=NIGHT)
     color = painter.color.numpy()[0]
     middle, reach = 32, int(0.25 * AHEAD.focal(64) / 4.0)
     high_left, high_right = color[middle - reach, middle - reach], color[middle - reach, middle + reach]
@@ -224,9 +226,43 @@ def test_a_texture_is_the_right_way_round_and_is_averaged_where_it_is_fine(devic
     assert high_left[1:].max() < 0.3 * high_left[0] and low_right.max() < 0.3
     fine = np.zeros((512, 512, 3), np.uint8)
     fine[::2, ::2] = fine[1::2, 1::2] = 255
-    seen = paint(device, [(corners, faces, {"texture": fine, "uv": uv})], ground=NIGHT).color.numpy()[0]
+    seen = paint(device, [(corners, faces, {"textures": on_all(faces, uv, fine)})], ground=NIGHT).color.numpy()[0]
     inner = seen[middle - reach : middle + reach, middle - reach : middle + reach].mean(-1)
     assert np.ptp(inner) < 0.05, "a fine pattern is grey at a distance, not noise"
+
+
+@pytest.mark.parametrize("wrap", [REPEAT, CLAMP, MIRROR])
+def test_a_checker_is_drawn_where_its_coordinates_say(device, wrap):
+    """Pixels of a quad of two triangles, whose corners are beyond the image, show a checker of 8 by 8 fields."""
+    corners, faces, uv = quad()
+    low, high, size = -0.3, 1.4, 256
+    fields = np.add.outer(np.arange(8), np.arange(8)) % 2
+    pixels = np.repeat(np.repeat(np.where(fields[..., None] > 0, [255, 255, 255], [0, 0, 0]), 16, 0), 16, 1)
+    tints = np.tile(np.array([[255, 188, 0]], np.uint8), (4, 1))
+    image = Texture(pixels.astype(np.uint8), (wrap, wrap))
+    textures = Textures((image,), np.zeros(2, int), low + (high - low) * uv, tints)
+    painter = paint(device, [(corners, faces, {"textures": textures})], size=size, ground=NIGHT)
+    color = painter.color.numpy()[0]
+    # the quad is at the distance that the view looks at, so a place on it is linear in the pixel
+    reach = AHEAD.focal(size) * 0.5 / 4.0
+    y, x = (np.arange(size) + 0.5 - 0.5 * size for _ in range(2))
+    places = low + (high - low) * (0.5 + 0.5 * np.stack(np.meshgrid(x, y), -1) / reach)
+    inside = (np.abs(x)[None] < reach - 2) & (np.abs(y)[:, None] < reach - 2)
+    cell = {REPEAT: places % 1.0, CLAMP: np.clip(places, 0.0, 0.999), MIRROR: 1.0 - np.abs(places % 2.0 - 1.0)}[wrap]
+    edge = np.abs(8.0 * places - np.round(8.0 * places)).min(-1) * reach / (4.0 * (high - low))
+    clear = inside & (edge > 1.5)  # [px] from the next border of a field
+    white = (np.floor(8.0 * cell).sum(-1).astype(int) % 2)[clear] > 0
+    assert clear.sum() > 1000 and 0.3 < white.mean() < 0.7
+    seen = color[clear]
+    assert (seen[white, 0] > 0.5).all() and (seen[~white, 0] < 0.1).all()
+    # the tint lets half of the green light pass, and no blue
+    light = srgb_to_linear(seen[white])
+    assert light[:, 1] / light[:, 0] == pytest.approx(0.5, abs=0.03) and light[:, 2].max() < 0.05
+
+
+def on_all(faces, uv, pixels):
+    """Return an image on all triangles."""
+    return Textures((Texture(pixels),), np.zeros(len(faces), int), uv, np.full((len(uv), 3), 255, np.uint8))
 
 
 def test_colours_of_vertices_and_rows_of_albedo(device):
@@ -317,8 +353,9 @@ def test_bad_requests_are_refused(device):
     ):  # fmt: skip
         with pytest.raises(ValueError, match=match):
             Painter(surfaces, **{"num_pictures": 1, "height": 16, "width": 16, "device": device, **options})
-    with pytest.raises(ValueError, match="uv"):
-        MeshPart(4, quad()[1], texture=np.zeros((4, 4, 3), np.uint8))
+    _, faces, uv = quad()
+    with pytest.raises(ValueError, match="uv of 4 vertices and images of 2 triangles; the mesh has 5 and 2"):
+        MeshPart(5, faces, textures=on_all(faces, uv, np.zeros((4, 4, 3), np.uint8)))
     with pytest.raises(ValueError, match="subject=300"):
         MeshPart(4, quad()[1], subject=300)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from piavatar_envs.avatar.body.textures import Texture, Textures
 from piavatar_envs.render import Arrow, Body, Box, Camera, Renderer, Sphere
 from piavatar_envs.render.overlay import draw_scale
 from piavatar_envs.render.views import Shot
@@ -219,6 +220,36 @@ def test_a_body_is_drawn_in_the_colours_of_its_vertices(renderer, body):
     assert green(renderer.render([strained])).sum() == 0
     with pytest.raises(ValueError, match="colors have shape"):
         renderer.render([Body(body.vertices, body.faces, colors=colors[:3])])
+
+
+def test_a_body_is_drawn_in_its_texture(renderer, body):
+    """Stripes whose places are the columns of the picture, each wider than the triangles that show them."""
+    at = project(np.asarray(body.vertices, np.float64)) / SIZE
+    stripes = np.zeros((8, 8, 3), np.uint8)
+    stripes[:, ::2], stripes[:, 1::2] = (255, 0, 0), (0, 0, 255)
+    count = len(body.vertices)
+    white = np.full((count, 3), 255, np.uint8)
+    textures = Textures((Texture(stripes),), np.zeros(len(body.faces), int), at.astype(np.float32), white)
+    beside = np.full((count, 3), (10, 230, 10), np.uint8)
+    textured = Body(body.vertices, body.faces, colors=beside, textures=textures)
+    seen = renderer.render([textured]).astype(int)
+    covered = green(renderer.render([body]))
+    stripe, within = np.divmod((np.arange(SIZE) + 0.5) * 8.0 / SIZE, 1.0)
+    clear = covered & (np.abs(within - 0.5) < 0.35)[None]
+    clear[1:-1] &= covered[:-2] & covered[2:]
+    clear[:, 1:-1] &= covered[:, :-2] & covered[:, 2:]
+    red = np.broadcast_to(stripe % 2 == 0, clear.shape)
+    assert (clear & red).sum() > 200 and (clear & ~red).sum() > 200
+    assert ((seen[..., 0] > seen[..., 2]) == red)[clear].mean() > 0.99
+    # without their textures, and in the colours of a quantity, they are as they were
+    colored = renderer.render([Body(body.vertices, body.faces, colors=beside)])
+    assert (green(colored) == covered).mean() > 0.99
+    scalars = np.zeros(count)
+    plain, both = (
+        renderer.render([Body(body.vertices, body.faces, scalars=scalars, textures=own)]) for own in (None, textures)
+    )
+    assert np.array_equal(plain, both)
+    assert np.array_equal(renderer.render([textured]), seen)
 
 
 def test_only_fronts_are_drawn(renderer, body):

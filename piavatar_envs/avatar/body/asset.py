@@ -10,6 +10,7 @@ import numpy as np
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, local_rotations
 from piavatar_envs.avatar.body.splats import SkinnedSplats
+from piavatar_envs.avatar.body.textures import Textures
 
 NUM_SKIN_JOINTS = 4
 SAMPLE_DEVIATION = 0.4  # standard deviation of a sampled shape parameter, before the clip to [-1, 1]
@@ -67,6 +68,7 @@ class Look:
         shape_deltas: displacements as those of the skin [m], shape ``(S, 2, W, 3)`` float32.
         pose: displacements that depend on the pose, if the file has such.
         splats: what is drawn in place of the triangles; they have the mean shape only.
+        textures: of the base colour, whose colours at the vertices are ``colors``, for views without textures.
     """
 
     vertices: np.ndarray
@@ -77,6 +79,7 @@ class Look:
     shape_deltas: np.ndarray
     pose: PoseDisplacements | None = None
     splats: SkinnedSplats | None = None
+    textures: Textures | None = None
 
     def colors_of(self, avatar: int) -> np.ndarray | None:
         """Return the colours of the avatar of an index in its scene, ``(W, 3)``; on each call the same array."""

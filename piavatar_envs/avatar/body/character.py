@@ -27,6 +27,7 @@ from piavatar_envs.avatar.body.skeleton import (
     local_rotations,
 )
 from piavatar_envs.avatar.body.skeleton_mesh import moved, read_skeleton
+from piavatar_envs.avatar.body.textures import Textures
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs
 from piavatar_envs.core.result_cache import digest_of, kept
 
@@ -77,6 +78,7 @@ class Character:
             the reference pose already.
         placement: matrix ``(3, 3)`` and origin ``(3,)`` [m] of our coordinates: ``vertex = matrix file - origin``.
         groups: weights in [0, 1] of the vertices in painted groups, each shape ``(V,)``.
+        textures: of the base colour, for the look; ``colors`` are those at the vertices.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Character:
     pose: PoseDisplacements | None = None
     placement: tuple[np.ndarray, np.ndarray] | None = None
     groups: Mapping[str, np.ndarray] = field(default_factory=dict)
+    textures: Textures | None = None
 
     @property
     def held(self) -> np.ndarray:
@@ -247,7 +250,10 @@ def _look(posed: Character, flipped: np.ndarray, part: np.ndarray) -> Look:
     """Return the surfaces of a posed character; those that are worn are drawn from both sides."""
     faces = np.array(posed.faces, np.int32)
     faces[flipped] = faces[flipped, ::-1]
-    faces, part = _coarser(posed.vertices, faces[part != _NONE], part[part != _NONE])
+    shown = np.flatnonzero(part != _NONE)
+    # across cells of a grid, triangles with few vertices would smear their textures over the seams
+    textures = posed.textures if len(shown) <= MOST_DRAWN else None
+    faces, part = _coarser(posed.vertices, faces[shown], part[shown])
     outer, once = np.unique(faces, return_inverse=True)
     inner, again = np.unique(faces[part == _WORN], return_inverse=True)
     chosen = np.concatenate([outer, inner])
@@ -260,6 +266,7 @@ def _look(posed: Character, flipped: np.ndarray, part: np.ndarray) -> Look:
         colors=None if posed.colors is None else np.ascontiguousarray(posed.colors[chosen], np.uint8),
         shape_deltas=np.asarray(posed.shape_deltas, np.float32).reshape(-1, 2, len(posed.vertices), 3)[:, :, chosen],
         pose=None if posed.pose is None else PoseDisplacements(posed.pose.directions[chosen], posed.pose.reference),
+        textures=None if textures is None else textures.chosen(chosen, np.concatenate([shown, shown[part == _WORN]])),
     )
 
 
@@ -308,6 +315,12 @@ def _check(character: Character) -> None:
             raise ValueError(f"{character.name}: {name} are not all finite")
     if len(character.faces) and not 0 <= character.faces.min() <= character.faces.max() < count:
         raise ValueError(f"{character.name}: a triangle names a vertex outside [0, {count})")
+    textures = character.textures
+    if textures is not None and (len(textures.uv), len(textures.image)) != (count, len(character.faces)):
+        raise ValueError(
+            f"{character.name}: textures of {len(textures.uv)} vertices and {len(textures.image)} triangles, it has "
+            f"{count} and {len(character.faces)}"
+        )
     height = float(np.ptp(character.vertices[:, 2])) if count else 0.0
     if not HEIGHTS[0] <= height <= HEIGHTS[1]:
         low, high = HEIGHTS

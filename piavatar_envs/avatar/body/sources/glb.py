@@ -24,6 +24,7 @@ from piavatar_envs.avatar.body.rigs import (
     read_mapping,
 )
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.textures import Textures, joined
 from piavatar_envs.avatar.gltf import Gltf, read_gltf
 from piavatar_envs.avatar.gltf_surfaces import Surfaces, read_surfaces
 
@@ -105,6 +106,7 @@ def read_character(path: str | Path, height: float | None = None, mapping: str |
         notes=tuple(notes),
         placement=(scale * axes, origin),
         groups=_painted(surfaces, kept),
+        textures=_textures(surfaces, kept),
     )
 
 
@@ -199,6 +201,12 @@ def _weights(surfaces: Surfaces, index: int, owners: np.ndarray) -> np.ndarray:
     weights = np.zeros((len(piece.points), NUM_JOINTS))
     np.add.at(weights, (np.arange(len(weights))[:, None], owners[piece.nodes]), piece.weights)
     return weights
+
+
+def _textures(surfaces: Surfaces, kept: list[int]) -> Textures | None:
+    """Return the textures of some pieces laid one after the other; None where none has any."""
+    pieces = [surfaces.pieces[index] for index in kept]
+    return joined([(piece.textures, piece.colors, len(piece.faces)) for piece in pieces])
 
 
 def _painted(surfaces: Surfaces, kept: list[int]) -> dict[str, np.ndarray]:

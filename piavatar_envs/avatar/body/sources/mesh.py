@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,6 +16,7 @@ from piavatar_envs.avatar.body.closed_skin import read_soup
 from piavatar_envs.avatar.body.registration import Registered, register
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.body.sources import embedded
+from piavatar_envs.avatar.body.textures import Texture, Textures, joined, reduced
 from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.avatar.gltf_surfaces import read_surfaces
 from piavatar_envs.core.extras import missing
@@ -33,6 +36,8 @@ UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 #: Colour of surfaces without one.
 _CLAY = (219, 194, 176)
+#: Size of a file that an OBJ file names.
+_MOST_BYTES = 2**26
 
 
 def build(path: str, height: float | None = None, up: str | None = None, skeleton: str | None = None) -> AvatarAsset:
@@ -56,7 +61,7 @@ def build(path: str, height: float | None = None, up: str | None = None, skeleto
 def read_character(path: str, height: float | None = None, up: str | None = None) -> Character:
     """Return the surface with joints and weights of the registered body; arguments and errors as for :func:`build`."""
     name = Path(path).name
-    vertices, faces, colors = _load(Path(path))
+    vertices, faces, colors, textures = _load(Path(path))
     if up not in (None, "y", "z"):
         raise ValueError(f"up={up!r} is no axis that points up; use y or z")
     found = []
@@ -88,56 +93,110 @@ def read_character(path: str, height: float | None = None, up: str | None = None
         shape_joints=np.zeros((0, 2, NUM_JOINTS, 3)),
         notes=(*notes, f"the registered body is {100.0 * registered.residual * tall:.2f} cm away on average"),
         placement=(turn.T @ matrix, np.zeros(3)),
+        textures=textures,
     )
 
 
-def _load(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, triangles and sRGB colours of a file, in its own unit and axes."""
+class _Loaded(NamedTuple):
+    """Surface of a file in its own unit and axes, its sRGB colours at the vertices, and its textures if it has any."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray
+    textures: Textures | None
+
+
+def _load(path: Path) -> _Loaded:
+    """Return the surface of a file."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(FORMATS)}")
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
-    vertices, faces, colors = (_load_gltf if path.suffix.lower() in _GLTF else _load_other)(path)
-    if not len(faces):
+    loaded = (_load_gltf if path.suffix.lower() in _GLTF else _load_other)(path)
+    if not len(loaded.faces):
         raise ValueError(
             f"{path.name} has no triangles; export a surface, not points, curves or an empty scene, or use the source "
             "gaussian for splats"
         )
-    if not np.isfinite(vertices).all():
+    if not np.isfinite(loaded.vertices).all():
         raise ValueError(f"{path.name} has vertices that are not finite; export it again")
-    return vertices, faces, colors.reshape(len(vertices), 3)
+    return loaded._replace(colors=loaded.colors.reshape(len(loaded.vertices), 3))
 
 
-def _load_gltf(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, triangles and colours of a glTF file; skins and held things are surfaces as any other."""
+def _load_gltf(path: Path) -> _Loaded:
+    """Return the surface of a glTF file; skins and held things are surfaces as any other."""
     surfaces = read_surfaces(read_gltf(path))
-    counts = [len(places) for places in surfaces.places]
-    starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-    faces = [start + own for start, own in zip(starts, surfaces.faces, strict=False)]
-    return (
-        np.concatenate([np.zeros((0, 3)), *surfaces.places]),
-        np.concatenate([np.zeros((0, 3), np.int64), *faces]),
-        np.concatenate([np.zeros((0, 3), np.uint8), *(piece.colors for piece in surfaces.pieces)]),
-    )
+    pieces = zip(surfaces.places, surfaces.faces, surfaces.pieces, strict=True)
+    return _joined([_Loaded(places, faces, piece.colors, piece.textures) for places, faces, piece in pieces])
 
 
-def _load_other(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, triangles and colours of a file that trimesh reads."""
+def _load_other(path: Path) -> _Loaded:
+    """Return the surface of a file that trimesh reads; of OBJ, with the materials of the file that it names."""
     try:
         import trimesh
     except ImportError as error:
         raise missing("an avatar from a mesh", "trimesh", "props") from error
     with reading(path.name, f"a readable {path.suffix} mesh"):
-        # a stream, not a path: nothing is looked up next to it
-        stream, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
-        loaded = trimesh.load(stream, file_type=kind, force="mesh", process=False)
-        vertices, faces = np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
-        colors = np.tile(np.array([_CLAY], np.uint8), (len(vertices), 1))
-        if loaded.visual.kind == "texture" and getattr(loaded.visual, "uv", None) is not None:
-            colors = np.array(loaded.visual.to_color().vertex_colors, np.uint8)[:, :3]
-        elif loaded.visual.kind in ("vertex", "face"):
-            colors = np.array(loaded.visual.vertex_colors, np.uint8)[:, :3]
-    return vertices, faces, colors
+        kind = path.suffix.lower()[1:]
+        # a stream, not a path, beside which nothing is looked up but by the resolver
+        stream, resolver = io.BytesIO(path.read_bytes()), _Beside(path.parent)
+        given = {"resolver": resolver} if kind == "obj" else {}
+        loaded = trimesh.load(stream, file_type=kind, process=False, **given)
+        meshes = loaded.geometry.values() if isinstance(loaded, trimesh.Scene) else [loaded]
+        return _joined([_painted(mesh, resolver.has_read) for mesh in meshes if isinstance(mesh, trimesh.Trimesh)])
+
+
+def _painted(mesh: Any, has_materials: bool) -> _Loaded:
+    """Return a mesh of trimesh with its colours and its texture; without materials, trimesh has one that stands in."""
+    vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    colors = np.tile(np.array([_CLAY], np.uint8), (len(vertices), 1))
+    visual, textures = mesh.visual, None
+    if visual.kind in ("vertex", "face"):
+        colors = np.array(visual.vertex_colors, np.uint8)[:, :3]
+    elif visual.kind == "texture" and has_materials:
+        uv, image = getattr(visual, "uv", None), getattr(visual.material, "image", None)
+        if image is not None and np.shape(uv) == (len(vertices), 2) and np.isfinite(uv).all():
+            # an OBJ file counts upwards from the lower border
+            places = np.asarray(uv, np.float32) * [1.0, -1.0] + [0.0, 1.0]
+            white = np.full((len(vertices), 3), 255, np.uint8)
+            textures = Textures((Texture(reduced(image)),), np.zeros(len(faces), np.int32), places, white)
+            colors = textures.colors(faces)
+        else:
+            colors[:] = np.asarray(visual.material.main_color)[:3]
+    return _Loaded(vertices, faces, colors, textures)
+
+
+def _joined(parts: Sequence[_Loaded]) -> _Loaded:
+    """Return surfaces laid one after the other."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    return _Loaded(
+        np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)]),
+        np.concatenate([np.zeros((0, 3), np.int64), *(a + p.faces for a, p in zip(starts, parts, strict=False))]),
+        np.concatenate([np.zeros((0, 3), np.uint8), *(part.colors for part in parts)]),
+        joined([(part.textures, part.colors, len(part.faces)) for part in parts]),
+    )
+
+
+class _Beside:
+    """Resolver of trimesh that reads files of limited size in a folder, and below it, only."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder.resolve()
+        self.has_read = False
+
+    def get(self, name: str) -> bytes:
+        """Return the content of a file.
+
+        Raises:
+            FileNotFoundError: it is not there, outside of the folder, or too large.
+        """
+        file = (self._folder / name.strip().replace("\\", "/")).resolve()
+        if not file.is_relative_to(self._folder) or not file.is_file() or file.stat().st_size > _MOST_BYTES:
+            raise FileNotFoundError(f"no file {name!r} of at most {_MOST_BYTES} bytes in the folder of the mesh")
+        self.has_read = True
+        return file.read_bytes()
+
+    __getitem__ = get
 
 
 def _possible_ups(vertices: np.ndarray, suffix: str) -> list[str]:
