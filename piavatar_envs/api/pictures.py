@@ -188,7 +188,7 @@ class Picture:
         from piavatar_envs.render import Renderer
 
         self.config = config
-        camera = task_camera(batch, batch.task)
+        camera = task_camera(batch, batch.task, config.width / config.height)
         self.renderer = Renderer(config.width, config.height, camera, scale=config.overlays)
         self._scenes = SceneReader(batch)
 
@@ -484,7 +484,8 @@ class Live:
             from piavatar_envs.envs.pixels import task_camera
             from piavatar_envs.render.live import LiveView
 
-            self._view = LiveView(task_camera(self._batch, self._batch.task), self._port)
+            # a browser's window is hardly narrower than high
+            self._view = LiveView(task_camera(self._batch, self._batch.task, 1.0), self._port)
         return self._view
 
     def begin(self) -> None:

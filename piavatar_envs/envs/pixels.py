@@ -11,7 +11,7 @@ from piavatar_envs.envs.task import Task
 from piavatar_envs.render.cameras import BatchCamera
 from piavatar_envs.render.painter import Painter
 from piavatar_envs.render.scene import Camera
-from piavatar_envs.render.stage import Stage
+from piavatar_envs.render.stage import Stage, bytes_of_stage
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,6 +28,7 @@ class PixelObserver:
 
     Attributes:
         stage: the surfaces of all environments.
+        painters: one a camera.
         arrays: by name, an array for each agent: ``"pixels"`` ``(num_envs, height, width, 3)`` uint8, ``"depth"``
             ``(num_envs, height, width, 1)`` float32 [m], ``"segmentation"`` ``(num_envs, height, width, 1)`` uint8.
             Agents that see through the same camera share them.
@@ -51,12 +52,15 @@ class PixelObserver:
         task.check_pixels()
         self._env, self._task = env, task
         settings, device, count = settings or task.config.pixels, env.device, count or env.num_envs
-        self.stage = Stage(env.simulation, task.marker_specs(), range(count))
         of_each_agent = settings.camera.kind not in ("task", "placed")
-        check_memory(count, env.num_agents if of_each_agent else 1, settings, device)
+        cameras, markers = env.num_agents if of_each_agent else 1, task.marker_specs()
+        check_memory(
+            count, bytes_of_pixels(settings, cameras), bytes_of_stage(env.simulation, markers), settings, device
+        )
+        self.stage = Stage(env.simulation, markers, range(count))
         size = settings.height, settings.width
         self._eyes: list[tuple[BatchCamera, Painter]] = []
-        for agent in range(env.num_agents if of_each_agent else 1):
+        for agent in range(cameras):
             painter = Painter(
                 self.stage.surfaces,
                 count,
@@ -71,7 +75,8 @@ class PixelObserver:
             self._eyes.append((_camera_of(settings, task, env, self.stage, agent, out), painter))
         self._all = wp.full(count, True, dtype=wp.bool, device=device)
         shape = (count, *size, 1)
-        self._farthest, painters = settings.farthest, [painter for _, painter in self._eyes]
+        self._farthest, self.painters = settings.farthest, [painter for _, painter in self._eyes]
+        painters = self.painters
         views = {"pixels": [painter.picture for painter in painters]}
         if settings.depth:
             views["depth"] = [wp.zeros(shape, dtype=float, device=device) for _ in painters]
@@ -88,8 +93,7 @@ class PixelObserver:
             graph: records.
             mask: environments whose pictures change, ``(num_envs,)`` bool; all if not given.
         """
-        # layers are drawn over a picture of surfaces, not over an earlier one of their own
-        chosen = self._all if mask is None or self.stage.splats else mask
+        chosen = self._all if mask is None else mask
         self._task.record_markers(self._env, graph, self.stage.markers)
         self.stage.record(graph)
         for camera, painter in self._eyes:
@@ -100,12 +104,24 @@ class PixelObserver:
             graph.launch(cut_depth, depth.shape[:3], [painter.depth, self._farthest], [depth])
 
 
-def check_memory(num_envs: int, num_cameras: int, settings: PixelsConfig, device: str) -> None:
-    """Check that the pictures of a batch fit into memory; beside them there are surfaces, which take less.
+def bytes_of_pixels(settings: PixelsConfig, num_cameras: int) -> int:
+    """Return the memory of the pixels of an environment [bytes].
+
+    Args:
+        settings: of the pictures.
+        num_cameras: of each environment.
+    """
+    pixel = BYTES_OF_PIXEL + BYTES_OF_DEPTH * settings.depth + settings.segmentation
+    return num_cameras * settings.width * settings.height * pixel
+
+
+def check_memory(num_envs: int, of_pixels: int, of_stage: int, settings: PixelsConfig, device: str) -> None:
+    """Check that the pictures of a batch fit into memory, but for workspaces, which do not grow with it.
 
     Args:
         num_envs: number of environments.
-        num_cameras: of each environment.
+        of_pixels: memory of the pixels of each [bytes].
+        of_stage: memory of the surfaces and splats of each [bytes].
         settings: of the pictures.
         device: Warp device.
 
@@ -115,14 +131,13 @@ def check_memory(num_envs: int, num_cameras: int, settings: PixelsConfig, device
     target = wp.get_device(device)
     if not target.is_cuda:
         return
-    pixel = BYTES_OF_PIXEL + BYTES_OF_DEPTH * settings.depth + settings.segmentation
-    need = num_envs * num_cameras * settings.width * settings.height * pixel
-    if need > target.free_memory:
-        fits = int(num_envs * target.free_memory / need)
+    each, free = of_pixels + of_stage, target.free_memory
+    if num_envs * each > free:
+        fewer = f"use num_envs <= {free // each}, or " if free >= each else "use "
         raise ValueError(
             f"pictures of {settings.width} x {settings.height} pixels of {num_envs} environments need "
-            f"{need / 2**30:.1f} GiB, {target} has {target.free_memory / 2**30:.1f} GiB free; use num_envs <= {fits}, "
-            "or less of pixels.width and pixels.height"
+            f"{num_envs * each / 2**30:.1f} GiB, {of_stage / each:.0%} of it for surfaces and splats; {target} has "
+            f"{free / 2**30:.1f} GiB free; {fewer}less of pixels.width and pixels.height"
         )
 
 
@@ -144,26 +159,28 @@ def _camera_of(
     if isinstance(chosen, PlacedCamera):
         camera, follows = Camera(chosen.position, chosen.target, angle or Camera().field_of_view), chosen.follows
     elif chosen.kind == "task":
-        camera, follows = task_camera(env, task, angle), task.camera_follows
+        aspect, follows = settings.width / settings.height, task.camera_follows
+        camera = task_camera(env, task, aspect, angle)
     size = settings.width, settings.height
     return BatchCamera(
         env.simulation, camera, *size, stage.envs, follows=follows, agent=agent, field_of_view=angle, out=out
     )
 
 
-def task_camera(env: EpisodeArrays, task: Task, field_of_view: float | None = None) -> Camera:
+def task_camera(env: EpisodeArrays, task: Task, aspect: float, field_of_view: float | None = None) -> Camera:
     """Return the task's camera, farther from bodies taller than :data:`SHOWN_HEIGHT` unless settings place it.
 
     Args:
         env: the environments.
         task: of theirs.
+        aspect: width over height of the pictures that it takes.
         field_of_view: vertical angle instead of the camera's own [deg].
     """
     render = task.config.render
     size = max(1.0, max(flesh.height for flesh in env.simulation.flesh) / SHOWN_HEIGHT)
     if render.camera_position is not None or render.camera_target is not None:
         size = 1.0
-    position, target = (tuple(size * value for value in place) for place in (task.camera_position, task.camera_target))
+    position, target = (tuple(size * value for value in place) for place in task.place_camera(aspect))
     return Camera(position, target, field_of_view or Camera().field_of_view)
 
 

@@ -119,8 +119,8 @@ class Task:
         camera_direction: from the scene to the camera of pictures, which is as near as it can be to hold :meth:`shown`.
         camera_follows: whether the camera goes with the agents' middle.
         camera_position, camera_target: the eye and the point that it looks at [m], from the ground below the agents'
-            middle, or from the origin if the camera does not follow; None until they are computed, unless a task or
-            the settings give both.
+            middle, or from the origin if the camera does not follow; None where :meth:`place_camera` computes them for
+            the shape of a picture, unless a task or the settings give them.
         reward_names, cost_names, metric_names: names of the terms and metrics; derived.
 
     Class attributes for the task's page in ``docs/envs`` (Markdown; ``python -m scripts.env_pages`` writes it):
@@ -226,30 +226,34 @@ class Task:
         self.config = config
         self.joints = select_joints(config.joints)
         self.scene = self.build_scene()
-        self._place_camera()
+        for name in ("camera_position", "camera_target", "camera_follows"):
+            chosen = getattr(config.render, name)
+            if chosen is not None:
+                setattr(self, name, chosen)
+        self.place_camera(config.render.width / config.render.height)
 
-    def _place_camera(self) -> None:
-        """Place the camera by the settings of pictures, where they are given, else such that it shows everything.
+    def place_camera(self, aspect: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Return :attr:`camera_position` and :attr:`camera_target`, or such that a picture shows everything.
+
+        Args:
+            aspect: width over height of the picture.
 
         Raises:
             ConfigError: the camera would look at its own place.
         """
-        for name in ("camera_position", "camera_target", "camera_follows"):
-            chosen = getattr(self.config.render, name)
-            if chosen is not None:
-                setattr(self, name, chosen)
-        if self.camera_position is None or self.camera_target is None:
+        position, target = self.camera_position, self.camera_target
+        if position is None or target is None:
             middle = (
                 np.mean([avatar.position for avatar in self.scene.avatars], axis=0) if self.camera_follows else (0, 0)
             )
             spheres = [(x - middle[0], y - middle[1], z, radius) for x, y, z, radius in self.shown()]
-            render = self.config.render
-            position, target = frame(spheres, self.camera_direction, render.width / render.height)
-            self.camera_position = self.camera_position or position
-            self.camera_target = self.camera_target or target
-        if np.allclose(self.camera_position, self.camera_target):
-            place = list(self.camera_position)
-            raise ConfigError(f"render.camera_position={place} is where it looks; move it or render.camera_target")
+            framed = frame(spheres, self.camera_direction, aspect)
+            position, target = position or framed[0], target or framed[1]
+        if np.allclose(position, target):
+            raise ConfigError(
+                f"render.camera_position={list(position)} is where it looks; move it or render.camera_target"
+            )
+        return position, target
 
     def build_scene(self) -> SceneConfig:
         """Return the configured scene with what the task adds to it.

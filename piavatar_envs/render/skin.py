@@ -236,6 +236,11 @@ def skin_workspace(surface: SkinSurface, pictures: int, device: str) -> SkinWork
     )
 
 
+def skin_bytes(particles: int) -> int:
+    """Return the memory of :func:`skin_workspace` for a picture, if so many particles move the skin [bytes]."""
+    return 4 * (NUM_JOINTS * (16 + 4 + 9) + 3 + 3 * particles)
+
+
 class SkinnedSurface(Protocol):
     """Skinning of an asset's vertices."""
 

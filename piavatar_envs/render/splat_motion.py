@@ -35,6 +35,8 @@ wp.set_module_options({"enable_backward": False})
 STRETCH = (0.3, 3.0)
 #: Spread of the particles around in a direction, over their largest, below which they do not span it.
 LEAST_SPREAD = 0.01
+#: Memory of a splat in a picture: its centre, covariance and rotation [bytes].
+BYTES_OF_SPLAT = 4 * (3 + 6 + 4)
 #: Splats whose stencils are computed together, which bounds memory.
 _TOGETHER = 20_000
 _POLAR_STEPS = wp.constant(5)

@@ -25,9 +25,10 @@ from piavatar_envs.render.skin import (
     SolidSurface,
     deform_prop,
     record_skin,
+    skin_bytes,
     skin_workspace,
 )
-from piavatar_envs.render.splat_motion import SplatMotion
+from piavatar_envs.render.splat_motion import BYTES_OF_SPLAT, SplatMotion
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.sim.markers import Markers, MarkerSpec, allocate_markers
@@ -35,6 +36,8 @@ from piavatar_envs.sim.world import Simulation
 
 #: Kinds of colliders that are drawn; planes are not.
 _DRAWN_COLLIDERS = ("sphere", "box", "capsule")
+#: Memory of a vertex in a picture [bytes].
+BYTES_OF_VERTEX = 12
 #: The name of the markers among the subjects.
 MARKERS = "markers"
 
@@ -67,6 +70,25 @@ class Part:
     def num_vertices(self) -> int:
         """Return the number of its vertices."""
         return self.vertices.stop - self.vertices.start
+
+
+def bytes_of_stage(simulation: Simulation, markers: Sequence[MarkerSpec] = ()) -> int:
+    """Return the memory of a picture's vertices and splats, and of what skins work in, at most [bytes].
+
+    Args:
+        simulation: the simulated world.
+        markers: what the task shows besides.
+    """
+    bodies = [(flesh.asset.drawn, len(flesh.points.rest[0])) for flesh in simulation.flesh]
+    vertices = sum(len(drawn.vertices) for drawn, _ in bodies)
+    vertices += sum(len(solid.vertices) for solid in simulation.props.points)
+    kinds = [solid.kind for solid in simulation.subjects.colliders[: len(simulation.subjects.collider_names)]]
+    kinds = [kind for kind in kinds if kind in _DRAWN_COLLIDERS] + [spec.kind for spec in markers]
+    vertices += sum(len(unit_mesh(kind)[0]) for kind in kinds)
+    clouds = [(drawn.splats, particles) for drawn, particles in bodies if drawn.splats is not None]
+    splats = sum(len(splats.cloud) for splats, _ in clouds)
+    skins = sum(skin_bytes(particles) for _, particles in (*bodies, *clouds))
+    return BYTES_OF_VERTEX * vertices + BYTES_OF_SPLAT * splats + skins
 
 
 class Stage:

@@ -284,6 +284,41 @@ def test_pictures_that_do_not_fit_are_refused(monkeypatch):
 
     monkeypatch.setattr(pixels.wp, "get_device", lambda _: Small())
     settings = PixelsConfig(width=1024, height=1024, depth=True)
-    pixels.check_memory(32, 1, settings, "cuda:0")
-    with pytest.raises(ValueError, match=r"1024 x 1024 pixels of 64 environments need 1\.7 GiB.* num_envs <= 37, or"):
-        pixels.check_memory(64, 1, settings, "cuda:0")
+    own, stage = pixels.bytes_of_pixels(settings, 1), 10**6
+    assert own == 1024**2 * (pixels.BYTES_OF_PIXEL + pixels.BYTES_OF_DEPTH)
+    most = Small.free_memory // (own + stage)
+    pixels.check_memory(most, own, stage, settings, "cuda:0")
+    with pytest.raises(ValueError, match=rf"1024 x 1024 pixels of {most + 1} .* num_envs <= {most}, or less"):
+        pixels.check_memory(most + 1, own, stage, settings, "cuda:0")
+    with pytest.raises(ValueError, match=r"free; use less of"):
+        pixels.check_memory(1, Small.free_memory, stage, settings, "cuda:0")
+
+
+def test_memory_is_counted_before_surfaces_are_built(make_env, monkeypatch):
+    from piavatar_envs.envs import pixels
+
+    def refuse(*_):
+        raise MemoryError
+
+    def never(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(pixels, "check_memory", refuse)
+    monkeypatch.setattr(pixels, "Stage", never)
+    with pytest.raises(MemoryError):
+        make_env(REACH, obs_mode="pixels", pixels={"width": 40})
+
+
+@pytest.mark.parametrize(("width", "height"), [(32, 96), (96, 32)])
+def test_everything_is_in_pictures_of_any_shape(make_env, equal, width, height):
+    settings = {"obs_mode": "pixels", "segmentation": True, "pixels": {"width": width, "height": height}}
+    env, tall = make_env(KICK, **settings), make_env(KICK, width=48, height=480, **settings)
+    seen, other = env.reset(seed=1)[0], tall.reset(seed=1)[0]
+    assert all(equal(seen[name], other[name]) for name in seen), "render() has no part in it"
+    labels = seen["segmentation"][..., 0]
+    for subject in range(1, len(env.batch.pixels.stage.subjects)):
+        rows, columns = np.nonzero(labels == subject)
+        assert len(rows), subject
+        assert 0 < rows.min() <= rows.max() < height - 1 and 0 < columns.min() <= columns.max() < width - 1
+    rows, columns = np.nonzero(labels)
+    assert max(np.ptp(rows) / height, np.ptp(columns) / width) > 0.4, "and it is not small"

@@ -236,8 +236,12 @@ def test_small_and_tall_bodies_have_room(device, height):
     env.reset(seed=0)
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert info["failure"] == 0
-    camera, shown = task_camera(env.batch, env.batch.task), 2.95 / SHOWN_HEIGHT if height > 2.0 else 1.0
-    np.testing.assert_allclose(camera.position, shown * np.array(env.batch.task.camera_position), rtol=0.05)
+    camera, shown = task_camera(env.batch, env.batch.task, 1.0), 2.95 / SHOWN_HEIGHT if height > 2.0 else 1.0
+    np.testing.assert_allclose(camera.position, shown * np.array(env.batch.task.place_camera(1.0)[0]), rtol=0.05)
+    env.close()
+    place = (3.0, -2.0, 1.0)
+    env = make(REACH, device, avatar={"source": "sized"}, camera_position=place)
+    assert task_camera(env.batch, env.batch.task, 1.0).position == place
     env.close()
 
 

@@ -18,7 +18,8 @@ from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.export import Recording
 from piavatar_envs.render.painter import Painter
-from piavatar_envs.render.stage import Stage
+from piavatar_envs.render.skin import skin_bytes
+from piavatar_envs.render.stage import Stage, bytes_of_stage
 from piavatar_envs.render.views import Shot, view_rows
 from piavatar_envs.tasks.games import load_game_task
 from tests.avatar.splat_clouds import on_body
@@ -124,5 +125,20 @@ def test_splats_are_observed_as_pixels(make_batch, equal):
     assert all(equal(own[0].numpy()[0], shown[name][1]) for name, own in alone.pixels.arrays.items())
     assert (shown["segmentation"] == 1).sum() > 60, "the avatar is seen"
     batch.reset(np.array([True, False, False]))
-    now = batch.pixels.arrays["pixels"][0].numpy()
-    assert equal(now[1:], shown["pixels"][1:]) and not equal(now[0], shown["pixels"][0])
+    now = {name: own[0].numpy() for name, own in batch.pixels.arrays.items()}
+    assert all(equal(own[1:], shown[name][1:]) for name, own in now.items())
+    assert not equal(now["pixels"][0], shown["pixels"][0])
+    assert [painter.drawn.numpy().tolist() for painter in batch.pixels.painters] == [[True, False, False]]
+
+
+@pytest.mark.parametrize("settings", [{}, SPLATS])
+def test_the_memory_of_a_picture_is_counted(make_batch, settings):
+    batch = make_batch("PIAvatar/KickBall-v0", **settings)
+    markers = batch.task.marker_specs()
+    stage = Stage(batch.simulation, markers)
+    arrays = [stage.vertices]
+    if stage.splats is not None:
+        arrays += [stage.splats.means, stage.splats.covariances, stage.splats.turns]
+    held, counted = sum(array.capacity for array in arrays), bytes_of_stage(batch.simulation, markers)
+    skins = (1 + bool(settings)) * skin_bytes(batch.simulation.flesh[0].points.rest.shape[1])
+    assert counted == held + skins

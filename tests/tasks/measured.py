@@ -96,6 +96,6 @@ def assert_all_is_seen(env, seeds=range(3)) -> None:
         scene = scenes.scene(0)
         points = [body.vertices for body in scene.bodies] + [marker.mesh()[0] for marker in scene.markers]
         center = (0.0, 0.0) if scene.follow is None else scene.follow[:2]
-        seen = places_in(task_camera(batch, batch.task), np.concatenate(points), center)
+        seen = places_in(task_camera(batch, batch.task, 1.0), np.concatenate(points), center)
         assert np.abs(seen).max() < 1.0
         assert np.ptp(seen[:, 1]) > 0.3  # and not a dot
