@@ -59,7 +59,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 def build(world: str, num_envs: int, settings: list[str], options: Options) -> EpisodeHost:
     """Build environments and begin their first episodes."""
     api = "torch" if torch_can_use(options.device) else "numpy"
-    task = make_task(world, options.fidelity, [*options.settings, *settings])
+    task = make_task(world, options.fidelity, settings)
     batched = EpisodeHost(task, num_envs, options.device, api, num_threads=1)
     batched.reset([*range(num_envs)])
     return batched
@@ -68,7 +68,8 @@ def build(world: str, num_envs: int, settings: list[str], options: Options) -> E
 def speed_without(world: str, num_envs: int, options: Options) -> float:
     """Measure environment steps a second without pictures."""
     gc.collect()  # what the batch before has left
-    (batch,) = build(world, num_envs, [], options).groups
+    settings = [setting for setting in options.settings if not setting.startswith("pixels.")]
+    (batch,) = build(world, num_envs, settings, options).groups
     return float(np.median(rates(Stepper(batch).step, num_envs, options)))
 
 
@@ -76,7 +77,7 @@ def measure(world: str, num_envs: int, size: int, options: Options) -> dict[str,
     """Measure one batch, or return the reason for its refusal."""
     gc.collect()  # what the batch before has left
     before = timing.array_bytes(options.device)
-    settings = ["obs_mode=pixels", f"pixels.width={size}", f"pixels.height={size}"]
+    settings = [*options.settings, "obs_mode=pixels", f"pixels.width={size}", f"pixels.height={size}"]
     try:
         batched = build(world, num_envs, settings, options)
         (batch,) = batched.groups

@@ -52,6 +52,17 @@ def _alone(method: Callable[..., Any]) -> Callable[..., Any]:
     return locked
 
 
+def check_mosaic(mosaic: int | None, num_envs: int) -> None:
+    """Refuse a picture of more environments than there are.
+
+    Raises:
+        ConfigError: see above.
+    """
+    if mosaic is not None and mosaic > num_envs:
+        remedy = f"at most {num_envs}" if num_envs > 1 else "a vector, as gym.make_vec makes it"
+        raise ConfigError(f"render.mosaic={mosaic} of num_envs={num_envs}; use {remedy}, or leave it out")
+
+
 class EpisodeHost:
     """``num_envs`` environments of a task: arrays in, copies out. Nothing resets by itself.
 
@@ -102,6 +113,7 @@ class EpisodeHost:
         """
         check_extra(render_mode, task.config.render.color)
         check_count("num_envs", num_envs)
+        check_mosaic(task.config.render.mosaic, num_envs)
         if num_threads is not None:
             check_count("num_threads", num_threads, ", or None for one a core")
         device = check_device(device)
@@ -562,7 +574,7 @@ class EpisodeHost:
         if self.live:
             return None
         if self.config.render.mosaic:
-            return (self.pictures.mosaic(min(self.config.render.mosaic, self.num_envs)),) * self.num_envs
+            return (self.pictures.mosaic(self.config.render.mosaic),) * self.num_envs
         return tuple(self.pictures.frame(env) for env in range(self.num_envs))
 
     def close(self) -> None:

@@ -774,6 +774,19 @@ class EnvConfig(BaseModel):
         return self.obs_mode in ("pixels", "pixels+state")
 
     @model_validator(mode="after")
+    def _check_pixels(self) -> EnvConfig:
+        """Refuse settings of observed pictures where none are observed."""
+        usual = type(self).model_fields["pixels"].get_default(call_default_factory=True)
+        if self.observes_pixels or self.pixels == usual:
+            return self
+        changed = [f"pixels.{name}" for name, value in self.pixels if value != getattr(usual, name)]
+        verb, those = ("has", "it") if len(changed) == 1 else ("have", "them")
+        raise ConfigError(
+            f"{', '.join(changed)} {verb} no effect under obs_mode={self.obs_mode!r}; use 'pixels' or 'pixels+state', "
+            f"or leave {those} out"
+        )
+
+    @model_validator(mode="after")
     def _check_avatars(self) -> EnvConfig:
         """Refuse an avatar's settings of another mode than the environment's; regions may have those of both."""
         for index, avatar in enumerate(self.scene.avatars):

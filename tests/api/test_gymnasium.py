@@ -39,6 +39,7 @@ KICK = "PIAvatar/KickBall-v0"
         ({"task": "Fly-v0"}, ["'Fly-v0'", "PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"]),
         ({"task": "sumo_v0"}, ["sumo_v0", "piavatar_envs.multi.sumo_v0.parallel_env"]),
         ({"shape.parameters": {"tallness": 0.5}}, ["shape.parameters", "'tallness'", "height"]),
+        ({"mosaic": 4}, ["render.mosaic=4", "num_envs=1", "gym.make_vec"]),
         ({"young_modulus": 1e9, "num_substeps": 4}, ["CFL limit", "num_substeps >= "]),
         (
             {"camera_position": (0.0, 0.0, 1.0), "camera_target": (0, 0, 1), "render_mode": "rgb_array"},

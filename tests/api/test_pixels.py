@@ -15,7 +15,7 @@ import piavatar_envs
 from piavatar_envs.api.conformance import check_task
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.body.textures import Texture, Textures
-from piavatar_envs.config import PixelsConfig
+from piavatar_envs.config import ConfigError, PixelsConfig
 from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks import task_modules
 
@@ -223,7 +223,6 @@ def test_rsl_rl_gets_pictures_as_groups(device):
     from rsl_rl.models import CNNModel
 
     from piavatar_envs.api.rsl_rl import AvatarRslEnv
-    from piavatar_envs.config import ConfigError
 
     env = AvatarRslEnv(REACH, 2, device, seed=0, fidelity="tiny", obs_mode="pixels", **SMALL)
     seen = env.step(torch.zeros(2, env.num_actions, device=env.device))[0]
@@ -254,6 +253,11 @@ def test_a_vector_shows_many_environments(make_vec, mosaic):
         assert all(np.ptp(tile) > 50 for tile in tiles) and not frames[0][24:, 32:].any()
     else:
         assert frames[0].shape == (24, 32, 3)
+
+
+def test_a_mosaic_of_more_environments_than_there_are_is_refused(make_vec):
+    with pytest.raises(ConfigError, match=r"render\.mosaic=5 of num_envs=3; use at most 3"):
+        make_vec(REACH, 3, render_mode="rgb_array", mosaic=5)
 
 
 def test_videos_of_a_vector_can_be_recorded(make_vec, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -132,13 +133,14 @@ def test_every_setting_is_described_with_its_unit():
 
 
 def test_bare_names_of_several_sections_are_those_of_pictures():
-    config = load_config(EnvConfig, None, {"width": 32, "camera": "head"})
+    config = load_config(EnvConfig, None, {"width": 32, "camera": "head", "obs_mode": "pixels"})
     assert config.render.width == 32 and config.pixels.width == 64 and config.pixels.camera.kind == "head"
 
 
 class Above(EnvConfig):
     """A task that is seen from above by default."""
 
+    obs_mode: Literal["flat", "pixels"] = Field("pixels", description="what is observed")
     pixels: PixelsConfig = Field(
         default_factory=lambda: PixelsConfig(camera=PlacedCamera(position=(0.0, -0.1, 5.0))), description="pictures"
     )
@@ -149,7 +151,8 @@ def test_another_camera_replaces_all_of_the_one_before():
     placed = {"kind": "placed", "position": [0, 0, 3]}
     for config in (load_config(Above, None, {"camera": "head"}), replace(load_config(Above), camera="head")):
         assert config.pixels.camera.kind == "head"
-    assert replace(load_config(EnvConfig, {"pixels": {"camera": placed}}), camera="task").pixels == PixelsConfig()
+    above = {"obs_mode": "pixels", "pixels": {"camera": placed}}
+    assert replace(load_config(EnvConfig, above), camera="task").pixels == PixelsConfig()
 
 
 class Held(EnvConfig):

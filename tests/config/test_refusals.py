@@ -66,6 +66,8 @@ def prop(**settings) -> dict:
         ({"pixels.camera.target": [0, 0, 1]}, "pixels.camera.target=[0, 0, 1]", "pixels.camera.kind='placed'"),
         ({"camera": {"kind": "placed", "position": [0, 0, 1], "target": [0, 0, 1]}}, "pixels.camera.", "move it"),
         ({"farthest": 0}, "pixels.farthest=0", "> 0 [m]"),
+        ({"depth": True}, "pixels.depth has no effect under obs_mode='flat'", "'pixels+state', or leave it out"),
+        ({"camera": "head", "pixels.width": 32, "obs_mode": "dict"}, "pixels.width, pixels.camera have", "'dict'"),
         ({"control.ton": 1}, "control.ton ", "control.tone?"),
         ({"control.young_modulus": 1}, "control.young_modulus ", "physics.young_modulus?"),
         ({"physcs": {"fidelity": "tiny"}}, "physcs ", "physics?"),
