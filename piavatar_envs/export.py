@@ -13,8 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.api.pictures import SceneReader
 from piavatar_envs.config import BodyColor
 from piavatar_envs.core.writing import check_writable
@@ -32,7 +33,7 @@ class Recording:
     def __init__(
         self,
         env: Any,
-        folder: Path,
+        folder: str | Path,
         kind: str = "glb",
         index: int = 0,
         color: BodyColor = "skin",
@@ -44,28 +45,45 @@ class Recording:
             folder: new, or empty.
             kind: "glb", "ply" or "usd".
             index: which one of a vector.
-            color: of the bodies.
+            color: of the bodies; "skin" for glb.
 
         Raises:
             ImportError: usd-core is not installed, for USD.
-            ValueError: there is no such environment or format, or the folder holds something.
+            TypeError: the folder is not a path.
+            ValueError: the environment is not of the suite, there is no such index, format or colour, the format cannot
+                hold the colours, or the folder holds something.
         """
-        batch = env.unwrapped.batch
-        if not 0 <= index < batch.num_envs:
-            raise ValueError(f"index={index} is outside [0, {batch.num_envs - 1}]")
+        folder = Path(folder)
+        check_format(kind)
+        check_color(color, kind)
+        host = getattr(getattr(env, "unwrapped", None), "host", None)
+        if not isinstance(host, EpisodeHost):
+            raise ValueError(f"{env} is not of this suite; use an environment or a vector of its ids")
+        if index not in range(host.num_envs):
+            raise ValueError(f"index={index} is outside [0, {host.num_envs - 1}]")
         check_folder(folder)
-        self.writer = film_writer(folder, kind, 1.0 / batch.config.physics.control_dt)
-        self._scenes, self._index, self._color = SceneReader(batch), index, color
+        batch, self._index = host.group_of(index)
+        self.writer = film_writer(folder, kind, 1.0 / host.config.physics.control_dt)
+        self._scenes, self._color = SceneReader(batch), color
 
     def add(self) -> None:
-        """Append what there is to see now, as the next frame: one a step in real time."""
+        """Append what there is to see now, as the next frame: one a step in real time.
+
+        What is not finite, because the simulation has failed, is left out with a warning; so are the frames after a
+        glTF file is full.
+
+        Raises:
+            OSError: the folder cannot be written, for ply.
+            ValueError: a single frame is too large for glTF.
+        """
         self.writer.add(self._scenes.scene(self._index, self._color))
 
     def finish(self) -> list[Path]:
         """Write what is not written yet, and return the files, or the folders of files.
 
         Raises:
-            ValueError: there is no frame, or the format cannot hold the film.
+            OSError: the folder cannot be written.
+            ValueError: there is no frame, or there is nothing to see in any.
         """
         return self.writer.finish()
 
@@ -108,8 +126,7 @@ def export(
     check_steps(steps)
     check_format(kind)
     check_folder(folder)
-    if color != "skin" and kind == "glb":
-        raise ValueError(f"color={color} changes with time, which glTF cannot hold; use --format ply or usd")
+    check_color(color, kind)
     env = make(env_id, settings_of(device, overrides))
     rollout = Rollout()
     try:
@@ -119,6 +136,19 @@ def export(
     finally:
         env.close()
     return rollout, recording.finish()
+
+
+def check_color(color: str, kind: str) -> None:
+    """Refuse a colour that is unknown, or that a format cannot hold.
+
+    Raises:
+        ValueError: it is such a colour.
+    """
+    known = get_args(BodyColor)
+    if color not in known:
+        raise ValueError(f"no color {color!r}; use {', '.join(known[:-1])} or {known[-1]}")
+    if color != "skin" and kind == "glb":
+        raise ValueError(f"color={color} changes with time, which glTF cannot hold; use the format ply or usd")
 
 
 def check_folder(folder: Path) -> None:

@@ -685,6 +685,12 @@ class HostView:
         """Name, slice, unit and frame of every term in the flat observation of an agent."""
         return self.host.layout
 
+    @property
+    def segmentation_names(self) -> tuple[str, ...]:
+        """Names by label of the observed ``segmentation``, the ground first; empty where no pictures are observed."""
+        pixels = self.host.groups[0].pixels
+        return pixels.stage.subjects if pixels else ()
+
     def assist_root(self, share: float | np.ndarray) -> None:
         """Set the share of root assistance from now on, in [0, 1]; for ``control="pd"`` and ``"torque"``.
 

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.api.vector_env import AvatarVectorEnv, single_infos
 from piavatar_envs.core.extras import missing
 from piavatar_envs.envs.task import Task
@@ -76,6 +77,16 @@ class SB3VecEnv(VecEnv):
         self._actions: np.ndarray | None = None
         super().__init__(num_envs, self.vector.single_observation_space, self.vector.single_action_space)
         self.metadata = {**self.metadata, "render_fps": self.vector.metadata["render_fps"]}
+
+    @property
+    def host(self) -> EpisodeHost:
+        """Holds the environments."""
+        return self.vector.host
+
+    @property
+    def segmentation_names(self) -> tuple[str, ...]:
+        """Names by label of the observed ``segmentation``, the ground first; empty where no pictures are observed."""
+        return self.vector.segmentation_names
 
     def reset(self) -> Any:
         """Begin episodes: of the seed given to :meth:`seed` before, or the next ones.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -24,9 +25,11 @@ class Moving:
     Attributes:
         name: a valid name of a file, and of a prim in USD.
         faces: outward oriented triangles, shape ``(T, 3)`` int.
-        shapes: vertices [m] in each frame, shape ``(V, 3)`` float32, or None where it is not there.
+        shapes: vertices [m] in each frame, shape ``(V, 3)`` float32, or None where it is not there; one that stays is
+            the same array.
         colors: sRGB of the vertices in each frame, shape ``(V, 3)`` uint8; equal ones are the same array.
         textures: of the base colour, of which these are the colours at the vertices; None without any.
+        changes: number of frames in which it is not as it was last seen.
     """
 
     name: str
@@ -34,6 +37,7 @@ class Moving:
     shapes: list[np.ndarray | None] = field(default_factory=list)
     colors: list[np.ndarray | None] = field(default_factory=list)
     textures: Textures | None = None
+    changes: int = 0
 
     @property
     def first(self) -> int:
@@ -56,11 +60,27 @@ class Moving:
     def append(self, frame: int, shape: np.ndarray, color: np.ndarray) -> None:
         """Add its shape and its colours in a frame; it was not there in those that were left out."""
         missing = frame - len(self.shapes)
-        last = next((kept for kept in reversed(self.colors) if kept is not None), None)
+        last = _last(self.colors)
         if last is not None and np.array_equal(last, color):
             color = last
+        before = _last(self.shapes)
+        if before is not None and np.array_equal(before, shape):
+            shape = before
+        self.changes += before is not None and shape is not before
         self.shapes += [*(missing * [None]), shape]
         self.colors += [*(missing * [None]), color]
+
+    def drop(self) -> None:
+        """Take back the last call of :meth:`append`."""
+        shape = self.shapes.pop()
+        self.colors.pop()
+        before = _last(self.shapes)
+        self.changes -= shape is not None and before is not None and shape is not before
+
+
+def _last(values: list[np.ndarray | None]) -> np.ndarray | None:
+    """Return the last one that is not None."""
+    return next((value for value in reversed(values) if value is not None), None)
 
 
 class Film:
@@ -91,6 +111,14 @@ class Film:
             mesh.append(self.num_frames, vertices, color)
         self.num_frames += 1
 
+    def drop(self) -> None:
+        """Take back the last frame."""
+        self.num_frames -= 1
+        for mesh in self._meshes.values():
+            if len(mesh.shapes) > self.num_frames:
+                mesh.drop()
+        self._meshes = {name: mesh for name, mesh in self._meshes.items() if _last(mesh.shapes) is not None}
+
     @property
     def meshes(self) -> list[Moving]:
         """The meshes so far, each with a shape or None for every frame."""
@@ -105,24 +133,36 @@ class Names:
     """Names of meshes in a series of scenes.
 
     A mesh that has the same place in the scene and the same triangles keeps its name, a marker one of the same colours
-    as well; others are numbered.
+    as well; others are numbered. What is not finite has no place that programs could read: it is left out, with a
+    warning about the first one.
     """
 
     def __init__(self) -> None:
         """Begin without names."""
         self._known: dict[tuple[str, int, bytes, bytes], str] = {}
+        self._has_warned = False
+
+    def shows(self, name: str, values: np.ndarray) -> bool:
+        """Return whether the values of something are finite; warn of the first that are not."""
+        finite = bool(np.isfinite(values).all())
+        if not finite and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"{name} is not finite, as in a simulation that has failed; it is left out of such frames", stacklevel=2
+            )
+        return finite
 
     def meshes(self, scene: Scene) -> Iterator[Named]:
-        """Yield name, vertices, triangles, colours (sRGB, uint8) and textures of everything in the next scene."""
+        """Yield name, vertices, triangles, colours (sRGB, uint8) and textures of everything seen in the next scene."""
         for place, vertices, faces, color, textures in _meshes(scene):
             fixed = b"" if place.startswith(_BODY) else color.tobytes()
             key = (place, len(vertices), np.ascontiguousarray(faces).tobytes(), fixed)
             if key not in self._known:
                 others = sum(other[0] == place for other in self._known)
                 self._known[key] = f"{place}_{others}" if others else place
-            # programs would not read what a failed simulation has
-            vertices = np.nan_to_num(np.asarray(vertices, dtype=np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-            yield self._known[key], vertices, faces, color, textures
+            vertices = np.asarray(vertices, dtype=np.float32)
+            if self.shows(self._known[key], vertices):
+                yield self._known[key], vertices, faces, color, textures
 
 
 def _meshes(scene: Scene) -> Iterator[Named]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+import warnings
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -30,13 +31,15 @@ MAX_GLB = 2**31
 _ARRAYS, _INDICES = 34962, 34963  # kinds of buffer views
 _FLOAT, _UINT32, _UINT16 = 5126, 5125, 5123
 _LINEAR, _STEP = "LINEAR", "STEP"
+#: Most text of the document for a mesh without its targets, and for each of its targets [bytes].
+_MESH_TEXT, _TARGET_TEXT = 3000, 800
 
 
 class FilmWriter(Protocol):
     """Writes a series of scenes into a folder."""
 
     def add(self, scene: Scene) -> None:
-        """Append a frame."""
+        """Append a frame; what is not finite is left out, with a warning."""
         ...
 
     def finish(self) -> list[Path]:
@@ -148,11 +151,6 @@ class _Glb:
 
 def write_glb(film: Film, folder: Path) -> Path:
     """Write ``film.glb`` and return its path; raises as :meth:`WholeWriter.finish`."""
-    needed = sum(24 * len(shape) for mesh in film.meshes for shape in mesh.shapes if shape is not None)
-    images = {id(image): image.pixels.nbytes for m in film.meshes if m.textures for image in m.textures.images}
-    needed += sum(images.values())
-    if needed > MAX_GLB:
-        raise ValueError(f"a glTF file of {film.num_frames} frames has {needed:.1e} bytes, 2^31 at most; export fewer")
     if any(mesh.repaints for mesh in film.meshes):
         raise ValueError("glTF has no colours that change; use ply or usd, or color=skin")
     glb = _Glb()
@@ -189,7 +187,7 @@ def _add_mesh(glb: _Glb, mesh: Moving) -> np.ndarray:
     """Append a mesh with a target for each shape after the first, and return the targets' weights ``(frames, K)``."""
     shapes = mesh.held()
     # a shape that stays has one target
-    changed = np.array([False, *(not np.array_equal(a, b) for a, b in pairwise(shapes))])
+    changed = np.array([False, *(a is not b for a, b in pairwise(shapes))])
     number = np.cumsum(changed)
     base, normals = _y_up(shapes[0]), _y_up(_normals(shapes[0], mesh.faces))
     parts, tints = _materials_of(glb, mesh)
@@ -250,29 +248,70 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(size > 1e-20, normals / np.maximum(size, 1e-20), (0.0, 0.0, 1.0))
 
 
+def glb_size(film: Film) -> int:
+    """Return how large the file of a film is at most [bytes], by what :func:`_add_mesh` writes."""
+    frames, meshes = film.num_frames, film.meshes
+    images = {id(image): image.pixels.nbytes for mesh in meshes if mesh.textures for image in mesh.textures.images}
+    size = _MESH_TEXT * (1 + len(images)) + 4 * frames + sum(images.values())
+    for mesh in meshes:
+        vertex = 12 + 12 + 8 + 8 + 24 * mesh.changes  # position, normal, colour, uv; displacements of the first two
+        weights, scale = 4 * frames * mesh.changes, 12 * frames
+        primitives = 1 + (len(mesh.textures.images) if mesh.textures else 0)
+        text = primitives * (_MESH_TEXT + _TARGET_TEXT * mesh.changes)
+        size += vertex * len(mesh.shapes[mesh.first]) + 4 * mesh.faces.size + weights + scale + text
+    return size
+
+
 class WholeWriter:
     """Writes one file when all frames are there: glTF or USD."""
 
     def __init__(self, folder: Path, kind: str, rate: float) -> None:
         """Begin without frames."""
         self._folder, self._write = folder, {"glb": write_glb, "usd": write_usd}[kind]
-        self._film = Film(rate)
+        self._film, self._is_full = Film(rate), False
 
     def add(self, scene: Scene) -> None:
-        """Append a frame."""
+        """Append a frame, unless a glTF file is full: a warning says how many frames it has.
+
+        Raises:
+            ValueError: the first frame is too large for glTF.
+        """
+        if self._is_full:
+            return
         self._film.add(scene)
+        if self._write is not write_glb or glb_size(self._film) <= MAX_GLB:
+            return
+        self._film.drop()
+        frames, limit = self._film.num_frames, f"{MAX_GLB:.3g} bytes, as many as a glTF file has at most"
+        if frames == 0:
+            raise ValueError(f"a frame of this scene takes more than {limit}; use ply or usd")
+        self._is_full = True
+        warnings.warn(
+            f"{frames} frames fill {limit}; later ones are left out: use ply or usd for them",
+            stacklevel=3,
+        )
 
     def finish(self) -> list[Path]:
         """Write the file.
 
         Raises:
-            ValueError: a film without frames, or one that is too long or has colours that change, for glTF.
+            ValueError: a film without frames, or with nothing that is seen, or one of colours that change, for glTF.
             OSError: the folder cannot be written.
         """
-        if self._film.num_frames == 0 or not self._film.meshes:
-            raise ValueError("this film shows nothing; add a scene first")
+        _check_seen(self._film.num_frames, bool(self._film.meshes))
         self._folder.mkdir(parents=True, exist_ok=True)
         return [self._write(self._film, self._folder)]
+
+
+def _check_seen(frames: int, seen: bool) -> None:
+    """Refuse a film of nothing.
+
+    Raises:
+        ValueError: it has no frames, or nothing is seen in them.
+    """
+    if not seen:
+        remedy = "add a scene first" if frames == 0 else f"in none of its {frames} frames is anything finite"
+        raise ValueError(f"this film shows nothing; {remedy}")
 
 
 class PlyWriter:
@@ -293,12 +332,18 @@ class PlyWriter:
         for name, vertices, faces, colors, _ in self._names.meshes(scene):
             write_mesh_ply(self._file(name), vertices, faces, colors)
         for index, body in enumerate(scene.bodies):
-            if body.splats is not None:
-                write_ply(self._file(f"splats_{index}"), body.splats.as_cloud())
+            name, splats = f"splats_{index}", body.splats
+            if splats is not None and self._names.shows(name, np.hstack([splats.means, splats.covariances])):
+                write_ply(self._file(name), splats.as_cloud())
         self._num_frames += 1
 
     def finish(self) -> list[Path]:
-        """Return the folders of the meshes and of the splats."""
+        """Return the folders of the meshes and of the splats.
+
+        Raises:
+            ValueError: there is no frame, or nothing is seen in any.
+        """
+        _check_seen(self._num_frames, bool(self._folders))
         return list(self._folders.values())
 
     def _file(self, name: str) -> Path:

@@ -184,24 +184,24 @@ class Stage:
             drawn = flesh.asset.drawn
             color = PALETTE[index % len(PALETTE)]
             given = len(drawn.vertices), drawn.faces, color, drawn.colors_of(index), drawn.textures
-            self._add(names[index], "avatar", *given)
-        for name, solid in zip(names[avatars:], self.solids, strict=True):
-            self._add(name, "prop", len(solid.vertices), solid.faces, PROP)
-        for collider in self._colliders:
-            kind, name = simulation.subjects.colliders[collider].kind, simulation.subjects.collider_names[collider]
+            self._add(1 + index, "avatar", *given)
+        for subject, solid in enumerate(self.solids, 1 + avatars):
+            self._add(subject, "prop", len(solid.vertices), solid.faces, PROP)
+        for subject, collider in enumerate(self._colliders, 1 + len(names)):
+            kind = simulation.subjects.colliders[collider].kind
             local, faces = unit_mesh(kind)
-            self._add(name, kind, len(local), faces, PROP)
+            self._add(subject, kind, len(local), faces, PROP)
         for spec in markers:
             local, faces = unit_mesh(spec.kind)
-            self._add(MARKERS, spec.kind, len(local), faces, spec.color)
+            self._add(len(self.subjects) - 1, spec.kind, len(local), faces, spec.color)
 
     def _add(
-        self, name: str, kind: str, count: int, faces: np.ndarray, color: Color, colors: np.ndarray | None = None,
+        self, subject: int, kind: str, count: int, faces: np.ndarray, color: Color, colors: np.ndarray | None = None,
         textures: Textures | None = None,
     ) -> None:  # fmt: skip
-        """Append a part."""
+        """Append a part; names are not unique, because a prop may be called as the markers are."""
         first = self.parts[-1].vertices.stop if self.parts else 0
-        subject = self.subjects.index(name, 1)
+        name = self.subjects[subject]
         self.parts.append(Part(name, kind, slice(first, first + count), faces, color, colors, textures, subject))
 
     def record(self, graph: LaunchGraph) -> None:

@@ -79,6 +79,14 @@ def test_avatars_are_seen_in_their_textures(make_env):
         assert (far > 100).mean() > share and (far < -50).sum() == 0
 
 
+def test_labels_have_names(make_env, make_vec):
+    names = ("ground", "agent_0", "ball", "markers")
+    assert make_env(KICK, **ALL).segmentation_names == names
+    vector = make_vec(KICK, **ALL)
+    assert vector.segmentation_names == names and vector.get_attr("segmentation_names") == (names,) * vector.num_envs
+    assert make_env(KICK).segmentation_names == ()
+
+
 def test_every_environment_can_be_seen(make_env):
     for env_id in task_modules():
         env = make_env(env_id, obs_mode="pixels", **SMALL)
@@ -180,6 +188,7 @@ def test_every_agent_of_a_game_sees(name, device, equal):
         observed, _ = env.reset(seed=0)
         assert all(env.observation_space(agent).contains(own) for agent, own in observed.items())
         seen[camera] = list(observed.values())
+        assert env.segmentation_names[: 1 + env.num_agents] == ("ground", *env.possible_agents)
         assert env.state().shape == env.state_space.shape
         env.close()
     assert equal(seen["task"][0], seen["task"][1]) and not equal(seen["head"][0], seen["head"][1])
@@ -194,6 +203,7 @@ def test_stable_baselines3_learns_from_pictures(device, mode, policy):
 
     settings = {"obs_mode": mode, "episode_seconds": 0.2, "pixels.width": 36, "pixels.height": 36}
     vector = SB3VecEnv(REACH, 2, device=device, fidelity="tiny", **settings)
+    assert vector.segmentation_names == ("ground", "agent_0", "markers")
     model = PPO(policy, vector, n_steps=8, batch_size=16, n_epochs=1, seed=0, device="cpu")
     before = [parameter.detach().clone() for parameter in model.policy.features_extractor.parameters()]
     model.learn(16)

@@ -12,7 +12,8 @@ from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.avatar.gltf_surfaces import read_surfaces
 from piavatar_envs.core.srgb import linear_to_srgb
 from piavatar_envs.render.coloring import color_by
-from piavatar_envs.render.film_files import film_writer
+from piavatar_envs.render.film import Film
+from piavatar_envs.render.film_files import film_writer, glb_size
 from piavatar_envs.render.scene import Body, Box, Scene, Solid, Sphere
 
 RATE, FRAMES = 25.0, 6
@@ -159,17 +160,69 @@ def test_markers_keep_their_names_when_others_are_hidden(tmp_path):
     assert scaled == {"box_0": [1, 0, 1], "sphere_2": [1, 0, 1], "sphere_1": [0, 1, 0]}
 
 
+def test_a_full_gltf_file_keeps_the_frames_before(tmp_path, monkeypatch):
+    film, sizes = Film(RATE), []
+    scenes = [Scene([Body(shape(frame), FACES, colors=COLORS)], []) for frame in range(FRAMES)]
+    for scene in scenes:
+        film.add(scene)
+        sizes.append(glb_size(film))
+    film.add(Scene(scenes[0].bodies, [Sphere(np.zeros(3), 0.1)]))
+    assert glb_size(film) > sizes[-1]
+    film.drop()
+    assert glb_size(film) == sizes[-1] and [mesh.name for mesh in film.meshes] == ["body_0"]
+    monkeypatch.setattr("piavatar_envs.render.film_files.MAX_GLB", sizes[3])
+    writer = film_writer(tmp_path, "glb", RATE)
+    with pytest.warns(UserWarning, match="4 frames fill") as caught:
+        for scene in scenes:
+            writer.add(scene)
+    (path,) = writer.finish()
+    assert len(caught) == 1 and path.stat().st_size <= sizes[3]
+    positions, _ = played(read_gltf(path), 0)
+    np.testing.assert_allclose(positions, [shape(frame) for frame in range(4)], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply", "usd"])
+def test_what_is_not_finite_is_left_out(tmp_path, kind):
+    if kind == "usd":
+        pytest.importorskip("pxr.Usd", reason="needs the extra usd")
+    writer = film_writer(tmp_path, kind, RATE)
+    with pytest.warns(UserWarning, match="body_1 is not finite") as caught:
+        for frame in range(3):
+            failed = shape(frame)
+            failed[frame:] = np.nan if frame else np.inf
+            writer.add(Scene([Body(shape(frame), FACES), Body(shape(0) if frame == 1 else failed, FACES)], []))
+    assert len(caught) == 1
+    paths = writer.finish()
+    if kind == "ply":
+        assert [file.name for file in paths[1].iterdir()] == ["0001.ply"]
+    elif kind == "glb":
+        gltf = read_gltf(paths[0])
+        np.testing.assert_array_equal(gltf.animations[0].tracks[0].values[:, 0], [0, 1, 0])
+        np.testing.assert_allclose(played(gltf, 1)[0][0], shape(0), atol=1e-5)
+    else:
+        from pxr import Usd, UsdGeom
+
+        seen = UsdGeom.Mesh(Usd.Stage.Open(str(paths[0])).GetPrimAtPath("/film/body_1")).GetVisibilityAttr()
+        assert [seen.Get(frame) for frame in range(3)] == ["invisible", "inherited", "invisible"]
+    writer = film_writer(tmp_path / "nothing", kind, RATE)
+    with pytest.warns(UserWarning):
+        writer.add(Scene([Body(np.full((4, 3), np.nan), FACES)], []))
+    with pytest.raises(ValueError, match="finite"):
+        writer.finish()
+
+
 def test_films_that_cannot_be_written_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="colours that change"):
         write(tmp_path, "glb", scalars=None)
     with pytest.raises(ValueError, match="no format"):
         write(tmp_path, "fbx")
-    with pytest.raises(ValueError, match="shows nothing"):
-        film_writer(tmp_path, "glb", RATE).finish()
+    for kind in ("glb", "ply"):
+        with pytest.raises(ValueError, match="shows nothing"):
+            film_writer(tmp_path, kind, RATE).finish()
     with pytest.raises(ValueError, match="rate"):
         film_writer(tmp_path, "glb", 0.0)
     monkeypatch.setattr("piavatar_envs.render.film_files.MAX_GLB", 1000)
-    with pytest.raises(ValueError, match="export fewer"):
+    with pytest.raises(ValueError, match="use ply or usd"):
         write(tmp_path, "glb")
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(ImportError, match="usd"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,15 +12,12 @@ from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.sources import load_asset, register_source
 from piavatar_envs.avatar.body.splat_files import read_splats
 from piavatar_envs.avatar.body.splats import SkinnedSplats
-from piavatar_envs.config import load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.export import Recording
 from piavatar_envs.render.painter import Painter
 from piavatar_envs.render.skin import skin_bytes
 from piavatar_envs.render.stage import Stage, bytes_of_stage
 from piavatar_envs.render.views import Shot, view_rows
-from piavatar_envs.tasks.games import load_game_task
 from tests.avatar.splat_clouds import on_body
 from tests.render.batches import act
 
@@ -96,14 +92,14 @@ def test_pictures_show_splats_and_the_shadow_of_the_body(make_batch):
 
 
 def test_agents_of_a_game_have_splats_of_their_own(device, tmp_path):
-    task = load_game_task("sumo_v0")
-    batch = BatchEnv(task(load_config(task.Config, None, {"fidelity": "tiny", **SPLATS})), 1, device)
-    batch.reset(seeds=[0])
-    stage = Stage(batch.simulation)
+    sumo_v0 = pytest.importorskip("piavatar_envs.multi.sumo_v0", exc_type=ImportError)
+    env = sumo_v0.parallel_env(fidelity="tiny", device=device, **SPLATS)
+    env.reset(seed=0)
+    stage = Stage(env.batch.simulation)
     means = moved(stage)[0][0]
     assert stage.splats.slices == {0: slice(0, COUNT), 1: slice(COUNT, 2 * COUNT)}
     assert np.linalg.norm(means[:COUNT].mean(axis=0) - means[COUNT:].mean(axis=0)) > 0.3
-    recording = Recording(SimpleNamespace(unwrapped=SimpleNamespace(batch=batch)), tmp_path / "film", "ply")
+    recording = Recording(env, tmp_path / "film", "ply")
     recording.add()
     folders = {folder.name: folder for folder in recording.finish()}
     for index, own in stage.splats.slices.items():

@@ -60,6 +60,15 @@ def test_parts_follow_one_another_and_have_labels(kicking):
     assert [(labels == part.subject).sum() for part in stage.parts] == [len(part.faces) for part in stage.parts]
 
 
+def test_a_prop_called_as_the_markers_has_a_label_of_its_own(make_batch):
+    prop = {"name": MARKERS, "shape": "sphere", "size": [0.15], "position": [1.0, 0.0, 0.5]}
+    batch = make_batch("PIAvatar/Reach-v0", **{"scene.props": [prop]})
+    stage = Stage(batch.simulation, batch.task.marker_specs())
+    assert stage.subjects == ("ground", "agent_0", MARKERS, MARKERS)
+    assert [(part.kind, part.subject) for part in stage.parts[:2]] == [("avatar", 1), ("prop", 2)]
+    assert {part.subject for part in stage.parts[2:]} == {3}
+
+
 def placed(batch, env: int = 0) -> np.ndarray:
     """Return the drawn vertices of a body whose particles are where the skinning puts them, by theory [m]."""
     flesh, avatar = batch.simulation.flesh[0], batch.simulation.avatars[0]
