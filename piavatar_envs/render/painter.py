@@ -50,6 +50,10 @@ class Painter:
         labels: subject of that surface, 0 for ground and sky, shape ``(N, height, width)`` uint8; None likewise.
         color: sRGB in [0, 1] of each pixel, shape ``(N, height, width)``, which the layers draw over.
         nearest: inverse depth of each pixel [1/m], 0 in the sky, shape ``(N, height, width)``.
+        coverage: share of a pixel's samples that show the subject that is nearest in it, shape ``(N, height, width)``;
+            empty without layers.
+        backdrop: sRGB of the other samples, and the inverse depth [1/m] of what they show, or of the former if there
+            are none, likewise.
         layers: drawn over the surfaces, in this order; append before :meth:`record`.
     """
 
@@ -108,6 +112,8 @@ class Painter:
         self._labels = wp.zeros(shape if segmentation else (0, 0, 0), dtype=wp.uint8, device=device)
         self.depth = self._depth if depth else None
         self.labels = self._labels if segmentation else None
+        self.coverage = wp.zeros((0, 0, 0), dtype=float, device=device)
+        self.backdrop = wp.zeros((0, 0, 0), dtype=wp.vec4, device=device)
         self.layers: list[Layer] = []
         self._ground = fill(Ground(), **{k: wp.vec3(*v) for k, v in vars(ground or GroundStyle()).items()})
         self._paint = fill(Paint(), surfaces)
@@ -118,6 +124,9 @@ class Painter:
 
     def record(self, graph: LaunchGraph) -> None:
         """Append the launches that draw all pictures from the present vertices and views."""
+        if self.layers and not self.coverage.size:
+            self.coverage = wp.zeros(self.color.shape, dtype=float, device=self.device)
+            self.backdrop = wp.zeros(self.color.shape, dtype=wp.vec4, device=self.device)
         for first in range(0, self.num_pictures, self.chunk):
             self._record_chunk(graph, first, min(self.chunk, self.num_pictures - first))
         for layer in self.layers:
@@ -145,7 +154,7 @@ class Painter:
                 vertices, lighting.light, lighting.lit, shadows.grids, shadows.opacity, raster.nearest,
                 raster.num_large,
             ],
-            [_flat(self.color), _flat(self.nearest), _flat(self._labels)],
+            [_flat(array) for array in (self.color, self.nearest, self._labels, self.coverage, self.backdrop)],
         )  # fmt: skip
 
     def _threads(self, items: int) -> int:

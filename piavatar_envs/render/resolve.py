@@ -166,6 +166,8 @@ def resolve(
     color: wp.array2d[wp.vec3],  # sRGB in [0, 1], (N, H * W)
     nearest: wp.array2d[float],  # inverse depth [1/m], 0 where the sky is seen, (N, H * W)
     labels: wp.array2d[wp.uint8],
+    coverage: wp.array2d[float],
+    backdrop: wp.array2d[wp.vec4],
 ):
     """Average the samples of a pixel; where nothing was drawn, show the ground or the background."""
     c, thread = wp.tid()
@@ -198,6 +200,10 @@ def resolve(
         behind = wp.where(share > 0.0, at[2], 0.0)
         total = wp.vec3()
         missing = of_pixel
+        # samples of surfaces beside the nearest one
+        others = wp.vec3()
+        num_others = int(0)
+        beside = behind
         label = int(0)
         in_front = wp.max(inverse_depth_of(greatest), behind)
         if inverse_depth_of(greatest) > behind:
@@ -205,6 +211,7 @@ def resolve(
         while inverse_depth_of(greatest) > behind:
             # Every triangle is shaded once a pixel, amid the samples that show it; they are cleared on the way.
             t = triangle_of(greatest) - 1
+            depth = inverse_depth_of(greatest)
             greatest = wp.uint64(0)
             count = int(0)
             place = wp.vec2()
@@ -243,6 +250,10 @@ def resolve(
                 seen = shade_texture(view, paint, texture, corner, p, q, r, weights, tint, own_light)
             total += float(count) * seen
             missing -= count
+            if paint.subject[t] != label:
+                others += float(count) * seen
+                num_others += count
+                beside = wp.max(beside, depth)
         if greatest != wp.uint64(0):
             for i in range(samples):
                 for j in range(samples):
@@ -253,10 +264,18 @@ def resolve(
                 back = wp.lerp(back, checker(ground, rays, view.eye, ray, at), share)
                 back = wp.lerp(back, ground.shadow, opacity_at(own, opacity, c, at[0], at[1]))
             total += float(missing) * back
+            others += float(missing) * back
         color[n, pixel] = total * (spacing * spacing)
         nearest[n, pixel] = in_front
         if labels.shape[0] > 0:
             labels[n, pixel] = wp.uint8(label)
+        if coverage.shape[0] > 0:
+            num_beside = missing + num_others
+            if num_beside == 0:
+                beside = in_front
+            mean = others / wp.max(float(num_beside), 1.0)
+            coverage[n, pixel] = 1.0 - float(num_beside) / float(of_pixel)
+            backdrop[n, pixel] = wp.vec4(mean[0], mean[1], mean[2], beside)
 
 
 @wp.kernel

@@ -51,9 +51,8 @@ class MovedSplats:
     @staticmethod
     def resting(cloud: SplatCloud, shift: np.ndarray) -> MovedSplats:
         """Return a cloud in its rest pose, shifted by ``(3,)`` [m]."""
-        covariances = cloud.covariances().reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].astype(np.float32)
         turns = np.tile(np.array(_UPRIGHT, np.float32), (len(cloud), 1))
-        return MovedSplats(cloud, (cloud.means + shift).astype(np.float32), covariances, turns)
+        return MovedSplats(cloud, (cloud.means + shift).astype(np.float32), cloud.packed_covariances(), turns)
 
     def as_cloud(self) -> SplatCloud:
         """Return a cloud of these splats, whose colours have turned with them."""

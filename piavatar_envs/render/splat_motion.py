@@ -13,7 +13,7 @@ line, the directions that they do not span turn with the bones. Singular values 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -161,6 +161,7 @@ class BoundSplats:
     skin: Skin
     slope: np.ndarray
     bound: np.ndarray
+    _uploaded: dict[str, SplatStencils] = field(default_factory=dict, init=False, repr=False)
 
     @staticmethod
     def of(
@@ -189,14 +190,18 @@ class BoundSplats:
         return BoundSplats(placed, skin, *stencils_of(*skin.stencil, rest_positions))
 
     def upload(self, device: str) -> SplatStencils:
-        """Return the constants on a device."""
+        """Return the constants on a device, uploaded once."""
+        if device not in self._uploaded:
+            self._uploaded[device] = self._upload(device)
+        return self._uploaded[device]
+
+    def _upload(self, device: str) -> SplatStencils:
         free = np.abs(self.bound).max(initial=0.0) == 0.0
-        covariances = self.cloud.covariances().reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
         return fill(
             SplatStencils(),
             slope=_upload(self.slope.transpose(1, 0, 2), wp.vec3, device),
             bound=_upload(np.zeros((0, 3, 3)) if free else self.bound, wp.mat33, device),
-            covariance=_upload(covariances, vec6, device),
+            covariance=_upload(self.cloud.packed_covariances(), vec6, device),
         )
 
 

@@ -2,8 +2,14 @@
 
 A Gaussian is projected by EWA splatting (Zwicker, Pfister, van Baar and Gross, "EWA volume splatting", 2001) and
 blended front to back as in Kerbl, Kopanas, Leimkühler and Drettakis, "3D Gaussian splatting for real-time radiance
-field rendering", ACM Trans. Graph. 42 (2023), eqs. 3 to 5. Splats are sorted by the depth of their centres, equals by
-their index, so that a picture does not depend on its place in a batch, nor on the schedule.
+field rendering", ACM Trans. Graph. 42 (2023), eqs. 3 to 5. A low-pass of a pixel's size widens it and takes from its
+opacity what it adds to its area, ``sqrt(det C / det(C + s I))`` with ``s`` of 0.1 px^2 (Yu, Chen, Huang, Sattler and
+Geiger, "Mip-Splatting: alias-free 3D Gaussian splatting", CVPR 2024), so that a body is as wide in small pictures as in
+large ones. Splats are sorted by the depth of their centres, equals by their index, so that a picture does not depend on
+its place in a batch, nor on the schedule.
+
+A pixel at the edge of a surface shows that surface and a backdrop beside it. Splats in front of the surface cover both,
+and those behind it the backdrop alone.
 
 Every launch and workspace has a size that is fixed when the painter is built. A GPU marks in a bit mask which of the
 sorted splats reach which tile of 16 x 16 pixels, instead of listing the pairs, whose number changes with the view:
@@ -17,6 +23,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.body.splats import FACTORS
 from piavatar_envs.core.arrays import vec6, vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render.raster import NEAR
@@ -33,7 +40,7 @@ MAX_CHUNK = 32
 #: Of the splats that are drawn together, and of the masks [bytes].
 SPLAT_WORKSPACE, MASK_WORKSPACE = 2**28, 2**27
 #: Of a projected splat: its record, key and index, the latter two twice [bytes].
-_SPLAT_BYTES = 64
+_SPLAT_BYTES = 68
 _DEPTH_BITS = 27
 
 _TILE = wp.constant(TILE)
@@ -44,7 +51,8 @@ _FURTHEST = wp.constant(2.0**11)
 _NEAREST_BITS = wp.constant(wp.uint32(np.float32(2.0**-5).view(np.uint32)))
 _LAST_KEY = wp.constant(wp.uint32(2**_DEPTH_BITS - 1))
 # Variance that the reconstruction filter of a pixel adds [px^2].
-_LOW_PASS = wp.constant(0.3)
+_LOW_PASS = wp.constant(0.1)
+_FACTORS = wp.constant(vec16(*FACTORS))
 # The projection is linearised at most this many half pictures from its axis.
 _WIDEST = wp.constant(1.3)
 _MAX_ALPHA, _MIN_ALPHA = wp.constant(0.99), wp.constant(1.0 / 255.0)
@@ -59,6 +67,8 @@ class Canvas(Protocol):
     views: wp.array  # View, (N,)
     color: wp.array  # vec3, sRGB in [0, 1], (N, H, W)
     nearest: wp.array  # inverse depth [1/m], 0 where nothing is, (N, H, W)
+    coverage: wp.array  # share of the pixel of the surface that is nearest, (N, H, W)
+    backdrop: wp.array  # vec4, sRGB and inverse depth beside it; the latter is that of ``nearest`` if nothing is
     labels: wp.array | None  # subjects, (N, H, W) uint8
 
 
@@ -67,7 +77,8 @@ class Records:
     """Projected splats of some pictures, sorted front to back, each array ``(pictures, splats)``."""
 
     place: wp.array2d[wp.vec4]  # centre, half width and half height [px]; the latter are -1 out of sight
-    shape: wp.array2d[wp.vec4]  # inverse covariance xx, xy, yy [1/px^2], and ln(opacity)
+    shape: wp.array2d[wp.vec4]  # inverse covariance xx, xy, yy [1/px^2], and ln(opacity) without the low-pass
+    share: wp.array2d[float]  # of its opacity, which the low-pass leaves
     tint: wp.array2d[wp.vec4]  # sRGB, and inverse depth [1/m]
 
 
@@ -92,24 +103,25 @@ def harmonics_of(d: wp.vec3) -> vec16:
     xx = x * x
     yy = y * y
     zz = z * z
-    return vec16(
-        0.28209479177387814,
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2.0 * zz - xx - yy),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3.0 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4.0 * zz - xx - yy),
-        0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-        -0.4570457994644658 * x * (4.0 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3.0 * yy),
+    terms = vec16(
+        1.0,
+        y,
+        z,
+        x,
+        x * y,
+        y * z,
+        2.0 * zz - xx - yy,
+        x * z,
+        xx - yy,
+        y * (3.0 * xx - yy),
+        x * y * z,
+        y * (4.0 * zz - xx - yy),
+        z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        x * (4.0 * zz - xx - yy),
+        z * (xx - yy),
+        x * (xx - 3.0 * yy),
     )
+    return wp.cw_mul(_FACTORS, terms)
 
 
 @wp.func
@@ -185,6 +197,7 @@ def project_splats(
     place = wp.vec4(0.0, 0.0, -1.0, -1.0)
     shape = wp.vec4(0.0)
     tint = wp.vec4(0.0)
+    share = float(0.0)
     if is_before(depth) and opacity >= _MIN_ALPHA:
         inverse = 1.0 / depth
         across = wp.dot(offset, view.right) * inverse
@@ -198,12 +211,16 @@ def project_splats(
         jx = scale * (view.right - wp.clamp(across, -widest, widest) * view.forward)
         jy = -scale * (view.up + wp.clamp(down, -highest, highest) * view.forward)
         covariance = covariances[picture, s]
-        xx = quadratic_form(covariance, jx, jx) + _LOW_PASS
+        xx = quadratic_form(covariance, jx, jx)
         xy = quadratic_form(covariance, jx, jy)
-        yy = quadratic_form(covariance, jy, jy) + _LOW_PASS
+        yy = quadratic_form(covariance, jy, jy)
+        unfiltered = wp.max(xx * yy - xy * xy, 0.0)
+        xx += _LOW_PASS
+        yy += _LOW_PASS
         determinant = xx * yy - xy * xy
         if determinant > 0.0 and determinant < 1.0e30:
-            # beyond this ellipse alpha is below its least value
+            share = wp.sqrt(unfiltered / determinant)
+            # beyond this ellipse alpha over share is below its least value; many faint splats make an opaque body
             reach = 2.0 * (wp.log(opacity) - _LOG_MIN_ALPHA)
             place = wp.vec4(
                 half_width + view.focal * across,
@@ -217,6 +234,7 @@ def project_splats(
             tint = wp.vec4(color[0], color[1], color[2], inverse)
     records.place[row, i] = place
     records.shape[row, i] = shape
+    records.share[row, i] = share
     records.tint[row, i] = tint
 
 
@@ -235,7 +253,7 @@ def covered(place: wp.vec4, width: int, height: int) -> wp.vec4i:
 
 @wp.func
 def alpha_at(place: wp.vec4, shape: wp.vec4, x: float, y: float) -> float:
-    """Return the opacity of a splat at a point of the picture (Kerbl et al. 2023, eq. 4); 0 below the least one."""
+    """Return the opacity of a splat at a point of the picture (Kerbl et al. 2023, eq. 4), over its share."""
     dx = x - place[0]
     dy = y - place[1]
     exponent = shape[3] - 0.5 * (shape[0] * dx * dx + shape[2] * dy * dy) - shape[1] * dx * dy
@@ -309,6 +327,15 @@ def put_in_front(
             labels[picture, y, x] = subjects[order[row * records.tint.shape[1] + front]]
 
 
+@wp.func
+def laid_over(
+    light: wp.vec3, before_surface: float, transmittance: float, color: wp.vec3, beside: float, backdrop: wp.vec4
+) -> wp.vec3:
+    """Return the colour of a pixel under splats, of which those behind its surface dim the backdrop beside it only."""
+    dimmed = beside * (before_surface - transmittance)
+    return light + before_surface * color - dimmed * wp.vec3(backdrop[0], backdrop[1], backdrop[2])
+
+
 @wp.kernel
 def blend_tiles(
     # in
@@ -321,6 +348,8 @@ def blend_tiles(
     records: Records,
     subjects: wp.array[wp.uint8],
     order: wp.array[int],
+    coverage: wp.array3d[float],
+    backdrop: wp.array3d[wp.vec4],
     # in, out
     color: wp.array3d[wp.vec3],
     nearest: wp.array3d[float],
@@ -341,8 +370,11 @@ def blend_tiles(
         picture = first + row
         center = wp.vec2(float(x) + 0.5, float(y) + 0.5)
         surface = nearest[picture, y, x]
+        behind = backdrop[picture, y, x][3]
+        beside = 1.0 - coverage[picture, y, x]
         light = wp.vec3(0.0)
         transmittance = float(1.0)
+        before_surface = float(1.0)
         front = int(-1)
         at = int(0)
         while at < words.shape[2]:
@@ -358,19 +390,27 @@ def blend_tiles(
                     if wp.abs(center[0] - place[0]) <= place[2] and wp.abs(center[1] - place[1]) <= place[3]:
                         alpha = alpha_at(place, records.shape[row, i], center[0], center[1])
                         if alpha > 0.0:
+                            alpha *= records.share[row, i]
                             tint = records.tint[row, i]
                             left = transmittance * (1.0 - alpha)
-                            if tint[3] < surface or left < _OPAQUE:
+                            if tint[3] < behind or left < _OPAQUE:
                                 bits = wp.uint32(0)
                                 some = wp.uint32(0)
                                 at = words.shape[2]
                             else:
-                                light += (transmittance * alpha) * wp.vec3(tint[0], tint[1], tint[2])
-                                if transmittance >= 0.5 and left < 0.5:
-                                    front = i
+                                share = transmittance * alpha
+                                if tint[3] < surface:
+                                    share *= beside
+                                else:
+                                    before_surface = left
+                                    if transmittance >= 0.5 and left < 0.5:
+                                        front = i
+                                light += share * wp.vec3(tint[0], tint[1], tint[2])
                                 transmittance = left
             at += 1
-        color[picture, y, x] = light + transmittance * color[picture, y, x]
+        color[picture, y, x] = laid_over(
+            light, before_surface, transmittance, color[picture, y, x], beside, backdrop[picture, y, x]
+        )
         put_in_front(row, picture, y, x, front, records, subjects, order, nearest, labels)
 
 
@@ -380,8 +420,11 @@ def blend_splats(
     first: int,
     records: Records,
     nearest: wp.array3d[float],
+    coverage: wp.array3d[float],
+    backdrop: wp.array3d[wp.vec4],
     # out
     light: wp.array3d[wp.vec4],  # colour, and transmittance: its negative where nothing more is blended
+    before_surface: wp.array3d[float],  # transmittance of the splats in front of the surface
     front: wp.array3d[int],  # sorted splat that takes half of the light, or -1
 ):
     """Blend the splats of a picture one after another, a picture a thread."""
@@ -391,6 +434,7 @@ def blend_splats(
     for y in range(height):
         for x in range(width):
             light[row, y, x] = wp.vec4(0.0, 0.0, 0.0, 1.0)
+            before_surface[row, y, x] = 1.0
             front[row, y, x] = -1
     for i in range(records.place.shape[1]):
         place = records.place[row, i]
@@ -401,20 +445,25 @@ def blend_splats(
                 if before[3] > 0.0:
                     alpha = alpha_at(place, records.shape[row, i], float(x) + 0.5, float(y) + 0.5)
                     if alpha > 0.0:
+                        alpha *= records.share[row, i]
                         tint = records.tint[row, i]
                         left = before[3] * (1.0 - alpha)
-                        if tint[3] < nearest[first + row, y, x] or left < _OPAQUE:
+                        if tint[3] < backdrop[first + row, y, x][3] or left < _OPAQUE:
                             light[row, y, x] = wp.vec4(before[0], before[1], before[2], -before[3])
                         else:
                             share = before[3] * alpha
+                            if tint[3] < nearest[first + row, y, x]:
+                                share *= 1.0 - coverage[first + row, y, x]
+                            else:
+                                before_surface[row, y, x] = left
+                                if before[3] >= 0.5 and left < 0.5:
+                                    front[row, y, x] = i
                             light[row, y, x] = wp.vec4(
                                 before[0] + share * tint[0],
                                 before[1] + share * tint[1],
                                 before[2] + share * tint[2],
                                 left,
                             )
-                            if before[3] >= 0.5 and left < 0.5:
-                                front[row, y, x] = i
 
 
 @wp.kernel
@@ -422,10 +471,13 @@ def lay_over(
     # in
     first: int,
     light: wp.array3d[wp.vec4],
+    before_surface: wp.array3d[float],
     front: wp.array3d[int],
     records: Records,
     subjects: wp.array[wp.uint8],
     order: wp.array[int],
+    coverage: wp.array3d[float],
+    backdrop: wp.array3d[wp.vec4],
     # in, out
     color: wp.array3d[wp.vec3],
     nearest: wp.array3d[float],
@@ -435,7 +487,14 @@ def lay_over(
     row, y, x = wp.tid()
     own = light[row, y, x]
     picture = first + row
-    color[picture, y, x] = wp.vec3(own[0], own[1], own[2]) + wp.abs(own[3]) * color[picture, y, x]
+    color[picture, y, x] = laid_over(
+        wp.vec3(own[0], own[1], own[2]),
+        before_surface[row, y, x],
+        wp.abs(own[3]),
+        color[picture, y, x],
+        1.0 - coverage[picture, y, x],
+        backdrop[picture, y, x],
+    )
     put_in_front(row, picture, y, x, front[row, y, x], records, subjects, order, nearest, labels)
 
 
@@ -503,6 +562,7 @@ class SplatPainter:
         self._records = Records()
         for name in ("place", "shape", "tint"):
             setattr(self._records, name, wp.zeros((self.chunk, count), dtype=wp.vec4, device=device))
+        self._records.share = wp.zeros((self.chunk, count), dtype=float, device=device)
         self.tiled = wp.get_device(device).is_cuda if tiled is None else tiled
         if self.tiled:
             across, words = -(-width // TILE), -(-count // 32)
@@ -513,6 +573,7 @@ class SplatPainter:
         else:
             shape = (self.chunk, height, width)
             self._light = wp.zeros(shape, dtype=wp.vec4, device=device)
+            self._before_surface = wp.zeros(shape, dtype=float, device=device)
             self._front = wp.zeros(shape, dtype=int, device=device)
 
     def record(self, graph: LaunchGraph, canvas: Canvas) -> None:
@@ -522,6 +583,7 @@ class SplatPainter:
         one.
         """
         labels = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device) if canvas.labels is None else canvas.labels
+        open_share = [canvas.coverage, canvas.backdrop]
         out = [canvas.color, canvas.nearest, labels]
         for first in range(0, self.num_pictures, self.chunk):
             rows = min(self.chunk, self.num_pictures - first)
@@ -532,23 +594,26 @@ class SplatPainter:
             motion = [self.means, self.covariances, self.turns, self.opacities, self.harmonics]
             graph.launch(project_splats, splats, [first, canvas.views, *motion, self._order], [self._records])
             if self.tiled:
-                self._record_tiles(graph, first, rows, out)
+                self._record_tiles(graph, first, rows, open_share, out)
             else:
-                blended = [self._light, self._front]
-                graph.launch(blend_splats, rows, [first, self._records, canvas.nearest], blended)
-                pixels = (rows, self.height, self.width)
-                graph.launch(lay_over, pixels, [first, *blended, self._records, self.subjects, self._order], out)
+                blended = [self._light, self._before_surface, self._front]
+                graph.launch(blend_splats, rows, [first, self._records, canvas.nearest, *open_share], blended)
+                pixels, kinds = (rows, self.height, self.width), [self.subjects, self._order]
+                graph.launch(lay_over, pixels, [first, *blended, self._records, *kinds, *open_share], out)
 
-    def _record_tiles(self, graph: LaunchGraph, first: int, rows: int, out: list[wp.array]) -> None:
+    def _record_tiles(
+        self, graph: LaunchGraph, first: int, rows: int, open_share: list[wp.array], out: list[wp.array]
+    ) -> None:
         size = [self.width, self.height]
         tiles, words = self._masks.shape[1:]
+        kinds = [self.subjects, self._order]
         for first_row in range(0, -(-self.height // TILE), self.tile_rows):
             graph.launch(mark_tiles, (rows, words), [self._records.place, *size, first_row], [self._masks])
             graph.launch(mark_words, (rows, tiles, self._words.shape[2]), [self._masks], [self._words])
             graph.launch(
                 blend_tiles,
                 rows * tiles * TILE * TILE,
-                [first, *size, first_row, self._masks, self._words, self._records, self.subjects, self._order],
+                [first, *size, first_row, self._masks, self._words, self._records, *kinds, *open_share],
                 out,
                 block_dim=TILE * TILE,
             )

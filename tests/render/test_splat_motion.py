@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
+from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.asset import dense_weights, top_weights
@@ -156,9 +157,27 @@ def silhouettes(puppet: Puppet, size: tuple[int, int]) -> tuple[np.ndarray, np.n
     return masks[0], masks[1]
 
 
-def test_bent_limbs_have_no_holes(device):
-    """The mesh has none; splats whose centres are as deep as they are wide end where it does."""
-    mesh, splats = silhouettes(Puppet(50_000, device, inset=1.05), (480, 400))
+@pytest.fixture(scope="module")
+def covered(device) -> Puppet:
+    """Return a body with splats all over whose centres are half as deep as they are wide: they end where it does."""
+    return Puppet(50_000, device, inset=0.5)
+
+
+@pytest.mark.parametrize(("size", "tolerance"), [(32, 0.13), (64, 0.05), (128, 0.03)])
+def test_a_body_has_the_area_of_its_mesh_in_small_pictures(covered, size, tolerance):
+    """Each splat is far smaller than a pixel."""
+    mesh, splats = silhouettes(covered, (size, size))
+    assert splats.sum() == pytest.approx(mesh.sum(), rel=tolerance)
+
+
+def test_bent_limbs_have_no_holes(covered):
+    """The mesh has none."""
+    mesh, splats = silhouettes(covered, (480, 400))
     assert mesh.sum() > 20_000
-    assert (mesh & splats).sum() > 0.995 * mesh.sum()
+    assert (binary_erosion(mesh) & ~splats).sum() == 0
+    assert (mesh & splats).sum() > 0.99 * mesh.sum()
     assert (mesh & splats).sum() > 0.98 * (mesh | splats).sum()
+
+
+def test_constants_are_uploaded_once(puppet):
+    assert puppet.bound.upload(puppet.device).slope.ptr == puppet.bound.upload(puppet.device).slope.ptr

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 #: Coefficients of a colour by the degree of its harmonics.
 COEFFICIENTS = (1, 4, 9, 16)
 #: Factors of the harmonics, in their order.
-_FACTORS = np.array([
+FACTORS = np.array([
     0.28209479177387814, -0.4886025119029199, 0.4886025119029199, -0.4886025119029199, 1.0925484305920792,
     -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396, -0.5900435899266435,
     2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658, 1.445305721320277,
@@ -113,6 +113,10 @@ class SplatCloud:
         axes = Rotation.from_quat(self.rotations.astype(np.float64)).as_matrix() * self.scales[:, None, :]
         return axes @ axes.transpose(0, 2, 1)
 
+    def packed_covariances(self) -> np.ndarray:
+        """Return the covariances as xx, xy, xz, yy, yz, zz [m^2], shape ``(S, 6)`` float32."""
+        return self.covariances().reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].astype(np.float32)
+
     def placed(self, turn: np.ndarray, size: float, shift: np.ndarray) -> SplatCloud:
         """Return the cloud after a similarity ``x -> size turn x + shift``.
 
@@ -169,12 +173,12 @@ def joined_colors(coefficients: Sequence[np.ndarray]) -> np.ndarray:
 
 def mean_colors(sh: np.ndarray) -> np.ndarray:
     """Return the means of colours over all directions, of coefficients ``(S, K, 3)``, shape ``(S, 3)``."""
-    return 0.5 + _FACTORS[0] * sh[:, 0]
+    return 0.5 + FACTORS[0] * sh[:, 0]
 
 
 def constant_colors(colors: np.ndarray) -> np.ndarray:
     """Return the coefficients of colours ``(S, 3)`` that are the same from all sides, shape ``(S, 1, 3)`` float32."""
-    return ((np.asarray(colors) - 0.5) / _FACTORS[0]).astype(np.float32)[:, None]
+    return ((np.asarray(colors) - 0.5) / FACTORS[0]).astype(np.float32)[:, None]
 
 
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
@@ -188,7 +192,7 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
         terms += [y * (3.0 * xx - yy), x * y * z, y * (4.0 * zz - xx - yy), z * (2.0 * zz - 3.0 * xx - 3.0 * yy)]
         terms += [x * (4.0 * zz - xx - yy), z * (xx - yy), x * (xx - 3.0 * yy)]
     count = COEFFICIENTS[degree]
-    return np.stack(terms[:count], axis=-1) * _FACTORS[:count]
+    return np.stack(terms[:count], axis=-1) * FACTORS[:count]
 
 
 def turned_colors(sh: np.ndarray, turns: np.ndarray) -> np.ndarray:
