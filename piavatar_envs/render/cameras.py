@@ -17,7 +17,7 @@ from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.scene import Camera
-from piavatar_envs.render.views import Shot, View
+from piavatar_envs.render.views import Shot, View, focal_length
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import AvatarAsset
@@ -211,7 +211,7 @@ class BatchCamera:
         else:
             forward, up, offset = np.array(self._mount.forward), np.array(self._mount.up), self._mount.offset
             right = np.cross(forward, up)
-            focal = 0.5 * height / math.tan(math.radians(0.5 * (field_of_view or BODY_FIELD_OF_VIEW)))
+            focal = focal_length(field_of_view or BODY_FIELD_OF_VIEW, height)
         vectors = {"offset": offset, "right": right, "up": up, "forward": forward}
         self._placement = fill(
             Placement(),

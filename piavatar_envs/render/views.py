@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,6 +57,16 @@ def ray_at(rays: Rays, x: float, y: float) -> wp.vec3:
     return rays.corner + x * rays.right + y * rays.down
 
 
+def focal_length(field_of_view: float, height: int) -> float:
+    """Return the focal length of a picture [px].
+
+    Args:
+        field_of_view: vertical angle [deg].
+        height: of the picture [px].
+    """
+    return 0.5 * height / math.tan(math.radians(0.5 * field_of_view))
+
+
 @dataclass(frozen=True, eq=False)
 class Shot:
     """Camera of one picture.
@@ -90,7 +101,7 @@ class Shot:
 
     def focal(self, height: int) -> float:
         """Return the focal length of a picture ``height`` pixels high [px]."""
-        return float(0.5 * height / np.tan(np.deg2rad(0.5 * self.field_of_view)))
+        return focal_length(self.field_of_view, height)
 
     def project(self, points: np.ndarray, height: int, width: int) -> np.ndarray:
         """Return the pixels ``(n, 2)``, x to the right and y down, of points ``(V, 3)`` [m] before the camera."""

@@ -75,6 +75,12 @@ def test_a_camera_on_a_body_turns_with_its_bone_and_does_not_see_it(moving, name
     np.testing.assert_allclose(offsets, offsets[:1] * 3, atol=1e-5)
 
 
+@pytest.mark.parametrize(("chosen", "angle"), [({}, 90.0), ({"field_of_view": 50.0}, 50.0)])
+def test_the_angle_of_a_camera_on_a_body(moving, chosen, angle):
+    views, _ = taken(moving, "head", **chosen)
+    np.testing.assert_allclose(views["focal"], 0.5 * SIZE / np.tan(np.radians(0.5 * angle)), rtol=1e-6)
+
+
 def test_an_unknown_camera_is_refused(moving):
     with pytest.raises(ValueError, match="use one of head, left_hand, right_hand"):
         taken(moving, "foot")

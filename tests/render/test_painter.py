@@ -154,6 +154,11 @@ def test_a_hidden_vertex_leaves_light_and_shadow_of_the_rest(device):
     np.testing.assert_array_equal(paint(device, boxes, vertices=vertices[None]).picture.numpy(), alone)
 
 
+def test_what_is_very_far_leaves_light_and_shadow_of_the_rest(device):
+    box, far = Box((0.0, 0.0, 0.3), (0.3, 0.2, 0.3)), Sphere((0.0, -300.0, 0.9), 0.2)  # behind the eye
+    np.testing.assert_array_equal(paint(device, [box, far]).picture.numpy(), paint(device, [box]).picture.numpy())
+
+
 def test_what_crosses_the_near_plane_is_cut_there(device):
     """Look along a large floor that passes below the eye and behind it; one plane gives the depth of every pixel."""
     square = np.array([[-9.0, -9.0, 0.5], [9.0, -9.0, 0.5], [9.0, 9.0, 0.5], [-9.0, 9.0, 0.5]])

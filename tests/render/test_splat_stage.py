@@ -99,6 +99,8 @@ def test_agents_of_a_game_have_splats_of_their_own(device, tmp_path):
     means = moved(stage)[0][0]
     assert stage.splats.slices == {0: slice(0, COUNT), 1: slice(COUNT, 2 * COUNT)}
     assert np.linalg.norm(means[:COUNT].mean(axis=0) - means[COUNT:].mean(axis=0)) > 0.3
+    (layer,) = stage.layers(16, 16)
+    assert layer.subjects.numpy().tolist() == COUNT * [1] + COUNT * [2]
     recording = Recording(env, tmp_path / "film", "ply")
     recording.add()
     folders = {folder.name: folder for folder in recording.finish()}

@@ -125,6 +125,14 @@ def test_a_gaussian_below_a_pixel_keeps_its_integrated_opacity(device, sizes, ti
     assert color[..., 0].sum() / 16 == pytest.approx(exact, rel=0.02)
 
 
+def test_the_image_of_a_gaussian_beside_the_picture_is_bounded(device):
+    given = np.array([[2.7, 0.0, 0.0]]), np.array([np.eye(3)]), np.array([[1.0, 0.5, 0.0]]), np.array([0.9])
+    color, _, _ = draw(device, [view()], *given)
+    expected = reference(*given, 0.2, 0.0)
+    np.testing.assert_allclose(color[0], expected, atol=1e-5)
+    assert np.abs(expected - 0.2).max() > 0.1
+
+
 def test_many_gaussians_equal_a_slow_reference(device):
     means, covariances, colors, opacities = cloud(700)
     turn = Rotation.from_euler("zxy", [40, -20, 10], degrees=True)
