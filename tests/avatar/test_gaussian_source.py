@@ -172,6 +172,22 @@ def test_splats_as_particles(body):
     assert (own.bone >= 0).sum() == (plain.bone >= 0).sum()
 
 
+@pytest.mark.parametrize(
+    ("name", "rows", "value", "message"),
+    [
+        ("means", [7], 1e20, r"^a.ply: 1 splats are farther away .* 16\.\d+ .* 10 times the body's height; delete"),
+        ("scales", [3, 7], 5e34, r"^a.ply: 2 splats are larger than 1\.6\d+ .* 1 times the body's height; delete"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_splats_of_absurd_place_or_size_are_refused(person, tmp_path, name, rows, value, message):
+    cloud = on_body(person, COUNT)
+    getattr(cloud, name)[rows] = value
+    write_ply(tmp_path / "a.ply", cloud)
+    with pytest.raises(ValueError, match=message):
+        load_asset("gaussian", tmp_path / "a.ply", up="z")
+
+
 def test_what_does_not_fit_is_refused(person, tmp_path, monkeypatch):
     cloud = on_body(person, COUNT)
     write_ply(tmp_path / "few.ply", cloud.chosen(np.arange(50)))

@@ -140,7 +140,7 @@ def header_of(lines: str, form: str = "binary_little_endian") -> bytes:
         ("a.ply", header_of("element vertex 1\n").replace(b"rot_3", b"rot_4"), "no property rot_3.*source mesh"),
         ("a.ply", header_of("element vertex 1\n").replace(b"float x", b"uchar x"), "x is of type u1"),
         ("a.ply", header_of("element vertex 1\n", "ascii") + b"1 2 x " * 5, "row 0 .* 15 numbers, not 14"),
-        ("a.spz", b"NGSP", "no SPZ of version 1 to 3"),
+        ("a.spz", b"NGSP", "no SPZ of version 2 or 3"),
         ("a.spz", b"\x1f\x8b123456", "a.spz is not a file"),
         ("a.glb", b"glTF", "a.glb is not a"),
         ("a.splat", b"", "use one of .ply, .spz"),
@@ -220,6 +220,17 @@ def test_an_spz_that_promises_more_than_it_holds_is_refused_without_gsply(tmp_pa
     (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(10_000_000)))
     with pytest.raises(ValueError, match="64 times its size"):
         read_splats(tmp_path / "a.spz")
+
+
+def test_an_spz_of_version_1_is_refused_by_name(tmp_path):
+    """Its places have 6 bytes, those of the later versions 9."""
+    import gzip
+
+    for size in (16, 19):
+        head = struct.pack("<IIIBBBB", 0x5053474E, 1, 10, 0, 12, 0, 0)
+        (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(range(10)) * size))
+        with pytest.raises(ValueError, match=r"SPZ of version 1, .*save it anew, or as \.ply"):
+            read_splats(tmp_path / "a.spz")
 
 
 def test_gsply_reads_the_same(cloud, tmp_path):

@@ -284,7 +284,7 @@ def _read_spz(path: Path) -> SplatCloud:
     """Return the splats of an SPZ file whose content is as long as its header says."""
     content = path.read_bytes()
     if content[:2] != b"\x1f\x8b":
-        raise ValueError("it is no SPZ of version 1 to 3; save it as such, or as .ply, as SuperSplat does")
+        raise ValueError("it is no SPZ of version 2 or 3; save it as such, or as .ply, as SuperSplat does")
     content = _inflated(content)
     count, degree, version = _spz_header(content)
     needed = 16 + count * (16 + (4 if version >= 3 else 3) + 3 * _SH_SIZES[degree])
@@ -316,8 +316,12 @@ def _spz_header(content: bytes) -> tuple[int, int, int]:
     if len(content) < 16:
         raise ValueError(f"it has {len(content)} bytes, fewer than a header")
     magic, version, count, degree, bits = struct.unpack_from("<IIIBB", content)
-    if magic != _SPZ_MAGIC or version not in (1, 2, 3):
-        raise ValueError(f"its header has the mark {magic:#x} and version {version}, and 1 to 3 are read")
+    if magic == _SPZ_MAGIC and version == 1:
+        raise ValueError(
+            "it is an SPZ of version 1, and 2 and 3 are read; save it anew, or as .ply, as SuperSplat does"
+        )
+    if magic != _SPZ_MAGIC or version not in (2, 3):
+        raise ValueError(f"its header has the mark {magic:#x} and version {version}, and 2 and 3 are read")
     if degree > 3 or not 1 <= bits <= 24:
         raise ValueError(f"its harmonics are of degree {degree} and its places have {bits} fractional bits")
     _check_count(count)

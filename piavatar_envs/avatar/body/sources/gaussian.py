@@ -43,6 +43,8 @@ UPS = {
 }
 #: Greatest mean distance between the splats and the fitted body, over the height; clothes are loose.
 MOST_RESIDUAL = 0.02
+#: Greatest distance of a splat from the body, and greatest standard deviation, over the body's height.
+MOST_DISTANCE, MOST_SCALE = 10.0, 1.0
 #: Splats whose mean colour a vertex of the body takes.
 _COLOR_SPLATS = 8
 
@@ -78,6 +80,7 @@ def build(
         raise ValueError(f"up={up!r} is no axis that points up; use one of {', '.join(UPS)}")
     asset = load_asset(**(body or {}))
     cloud = read_splats(path)
+    _check_extent(cloud, Path(path).name)
     rotations = None if pose in (None, *POSES) else _read_pose(Path(pose))
     starts = (pose,) if pose in POSES else (POSES if pose is None else ("A",))
     fits = []
@@ -129,6 +132,22 @@ def _asset(
         groups=asset.groups,
         surface_points=points,
     )
+
+
+def _check_extent(cloud: SplatCloud, name: str) -> None:
+    """Refuse splats that are far away or large, in comparison with the longest side of the body's box."""
+    low, high = opaque_box(cloud)
+    height = float((high - low).max())
+    away = np.maximum(low - cloud.means, cloud.means - high).max(axis=1)
+    for count, what, most in (
+        (int((away > MOST_DISTANCE * height).sum()), "farther away from the body than", MOST_DISTANCE),
+        (int((cloud.scales.max(axis=1) > MOST_SCALE * height).sum()), "larger than", MOST_SCALE),
+    ):
+        if count:
+            raise ValueError(
+                f"{name}: {count} splats are {what} {most * height:.4g} in the file's unit, {most:g} times the body's "
+                "height; delete them, as in SuperSplat"
+            )
 
 
 def _possible_ups(cloud: SplatCloud, path: Path) -> tuple[str, ...]:
