@@ -630,13 +630,17 @@ class SceneConfig(BaseModel):
 BodyColor = Literal["skin", "strain", "distortion", "impulse"]
 
 
+#: Least width and height of a picture: of an observed one, and of a frame, which may hold text [pixel].
+LEAST_PICTURE, LEAST_FRAME = 8, 16
+
+
 class RenderConfig(BaseModel):
     """Pictures of the scene; used only with a ``render_mode``."""
 
     model_config = FROZEN
 
-    width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
-    height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
+    width: int = Field(480, ge=LEAST_FRAME, le=7680, description="width of a frame [pixel]")
+    height: int = Field(480, ge=LEAST_FRAME, le=4320, description="height of a frame [pixel]")
     color: BodyColor = Field(
         "skin",
         description="colour of the bodies of avatars: their own (skin); the largest change of a principal stretch "
@@ -699,8 +703,8 @@ class PixelsConfig(BaseModel):
 
     model_config = FROZEN
 
-    width: int = Field(64, ge=8, le=1024, description="width of an observed picture [pixel]")
-    height: int = Field(64, ge=8, le=1024, description="height of an observed picture [pixel]")
+    width: int = Field(64, ge=LEAST_PICTURE, le=1024, description="width of an observed picture [pixel]")
+    height: int = Field(64, ge=LEAST_PICTURE, le=1024, description="height of an observed picture [pixel]")
     camera: NamedCamera | PlacedCamera = Field(
         default_factory=NamedCamera, discriminator="kind", description="what is seen"
     )

@@ -6,6 +6,7 @@ from typing import Protocol
 
 import warp as wp
 
+from piavatar_envs.config.schema import LEAST_PICTURE
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.ground import Ground, GroundStyle
@@ -16,8 +17,8 @@ from piavatar_envs.render.shadows import Shadows
 from piavatar_envs.render.surfaces import Surfaces
 from piavatar_envs.render.views import View
 
-#: Least and greatest number of pixels along a side of a picture, and samples along a side of a pixel at most.
-LEAST_SIDE, GREATEST_SIDE, MOST_SAMPLES = 4, 8192, 4
+#: Greatest number of pixels along a side of a picture, and of samples along a side of a pixel.
+GREATEST_SIDE, MOST_SAMPLES = 8192, 4
 #: Memory of the workspace of the pictures that are drawn at the same time [bytes].
 _WORKSPACE = 1 << 28
 #: Threads that all pictures of a chunk have together on a GPU, about.
@@ -91,8 +92,8 @@ class Painter:
             ValueError: a size or a number of samples out of range, or an array of another shape.
         """
         for name, value in (("height", height), ("width", width)):
-            if not LEAST_SIDE <= value <= GREATEST_SIDE:
-                raise ValueError(f"{name}={value} px is outside [{LEAST_SIDE}, {GREATEST_SIDE}]")
+            if not LEAST_PICTURE <= value <= GREATEST_SIDE:
+                raise ValueError(f"{name}={value} px is outside [{LEAST_PICTURE}, {GREATEST_SIDE}]")
         if not 1 <= samples <= MOST_SAMPLES:
             raise ValueError(f"samples={samples} is outside [1, {MOST_SAMPLES}]: it is along each side of a pixel")
         if num_pictures < 1:

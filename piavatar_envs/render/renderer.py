@@ -12,6 +12,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body.splats import joined_colors
 from piavatar_envs.avatar.body.textures import Textures
+from piavatar_envs.config.schema import LEAST_FRAME
 from piavatar_envs.core.capture_lock import CAPTURE
 from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -23,9 +24,6 @@ from piavatar_envs.render.scene import Body, Camera, Follower, Marker, MovedSpla
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces, linear_albedo
 from piavatar_envs.render.views import Shot, view_rows
-
-#: Least side of a picture [px].
-_LEAST_SIDE = 16
 
 
 class Renderer:
@@ -58,8 +56,8 @@ class Renderer:
             ValueError: a size outside [16, 8192].
         """
         for name, value in (("width", width), ("height", height)):
-            if not _LEAST_SIDE <= value <= GREATEST_SIDE:
-                raise ValueError(f"{name}={value} px is outside [{_LEAST_SIDE}, {GREATEST_SIDE}]")
+            if not LEAST_FRAME <= value <= GREATEST_SIDE:
+                raise ValueError(f"{name}={value} px is outside [{LEAST_FRAME}, {GREATEST_SIDE}]")
         init_warp()
         self.width, self.height = int(width), int(height)
         self.camera = camera or Camera()
