@@ -17,8 +17,9 @@ wp.set_module_options({"enable_backward": False})
 
 #: Height of the bodies that tasks place their cameras for, at most [m].
 SHOWN_HEIGHT = 1.8
-#: Memory of a pixel: its bytes, colour and inverse depth; and of its depth, as drawn and as observed [bytes].
-BYTES_OF_PIXEL, BYTES_OF_DEPTH = 3 + 12 + 4, 4 + 4
+#: Memory of a pixel: its bytes, colour and inverse depth; of its depth, as drawn and as observed; and of the share and
+#: the colour of what splats are blended beside [bytes].
+BYTES_OF_PIXEL, BYTES_OF_DEPTH, BYTES_BESIDE = 3 + 12 + 4, 4 + 4, 4 + 16
 
 
 class PixelObserver:
@@ -54,9 +55,9 @@ class PixelObserver:
         settings, device, count = settings or task.config.pixels, env.device, count or env.num_envs
         of_each_agent = settings.camera.kind not in ("task", "placed")
         cameras, markers = env.num_agents if of_each_agent else 1, task.marker_specs()
-        check_memory(
-            count, bytes_of_pixels(settings, cameras), bytes_of_stage(env.simulation, markers), settings, device
-        )
+        splats = any(flesh.asset.drawn.splats is not None for flesh in env.simulation.flesh)
+        own, stage = bytes_of_pixels(settings, cameras, splats), bytes_of_stage(env.simulation, markers)
+        check_memory(count, own, stage, settings, device)
         self.stage = Stage(env.simulation, markers, range(count))
         size = settings.height, settings.width
         self._eyes: list[tuple[BatchCamera, Painter]] = []
@@ -104,14 +105,15 @@ class PixelObserver:
             graph.launch(cut_depth, depth.shape[:3], [painter.depth, self._farthest], [depth])
 
 
-def bytes_of_pixels(settings: PixelsConfig, num_cameras: int) -> int:
+def bytes_of_pixels(settings: PixelsConfig, num_cameras: int, has_splats: bool = False) -> int:
     """Return the memory of the pixels of an environment [bytes].
 
     Args:
         settings: of the pictures.
         num_cameras: of each environment.
+        has_splats: whether an avatar is drawn as splats.
     """
-    pixel = BYTES_OF_PIXEL + BYTES_OF_DEPTH * settings.depth + settings.segmentation
+    pixel = BYTES_OF_PIXEL + BYTES_OF_DEPTH * settings.depth + settings.segmentation + BYTES_BESIDE * has_splats
     return num_cameras * settings.width * settings.height * pixel
 
 

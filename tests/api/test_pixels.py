@@ -300,6 +300,7 @@ def test_pictures_that_do_not_fit_are_refused(monkeypatch):
     settings = PixelsConfig(width=1024, height=1024, depth=True)
     own, stage = pixels.bytes_of_pixels(settings, 1), 10**6
     assert own == 1024**2 * (pixels.BYTES_OF_PIXEL + pixels.BYTES_OF_DEPTH)
+    assert pixels.bytes_of_pixels(settings, 1, has_splats=True) > own
     most = Small.free_memory // (own + stage)
     pixels.check_memory(most, own, stage, settings, "cuda:0")
     with pytest.raises(ValueError, match=rf"1024 x 1024 pixels of {most + 1} .* num_envs <= {most}, or less"):
