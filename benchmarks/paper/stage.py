@@ -120,6 +120,10 @@ class _Backdrop:
     camera_target: tuple[float, float, float]
     camera_follows: bool = False
 
+    def place_camera(self, _aspect: float) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Return the camera's position and target, which the act chooses for any picture."""
+        return self.camera_position, self.camera_target
+
     def marker_specs(self) -> tuple:
         """Return no markers, as only matter is drawn."""
         return ()
