@@ -25,7 +25,7 @@ from tqdm import tqdm
 from agents.checkpoint import read_checkpoint
 from agents.command import one_line_errors, read_options
 from agents.config import EvaluationSettings, changed, check_imports
-from agents.evaluate import Agent, begin_round, each_array, for_all_seats, play
+from agents.evaluate import Agent, Seen, begin_round, each_array, for_all_seats, play
 from agents.files import CHECKPOINT, RESULTS, check_figures
 from agents.report import show_table, versions, write_results
 from agents.sb3.config import load_training
@@ -38,9 +38,8 @@ from piavatar_envs.core.writing import check_writable
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.envs.task import Task
-from piavatar_envs.export import Recording, check_folder
+from piavatar_envs.export import Recording, check_recording
 from piavatar_envs.render import label, side_by_side, write_video
-from piavatar_envs.render.film_files import check_format
 from piavatar_envs.render.video import check_suffix
 from piavatar_envs.tasks import load_task
 
@@ -183,8 +182,7 @@ def check_options(options: Options) -> None:
         check_figures(options.out, "play")
     check_film(options.film, options.film_every, options.film_episodes)
     if options.export:
-        check_format(options.format)
-        check_folder(options.export)
+        check_recording(options.export, options.format)
     if options.first_seed is not None:
         check_seeds(options.first_seed, name="first_seed")
 
@@ -247,11 +245,16 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
     agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
     watch_env(
         made,
-        lambda seen: agent(each_array(lambda own: own[None, None], seen))[0, 0],
+        lambda seen: act_alone(agent, seen),
         first,
         options.port,
         lambda: begin_round(agent, 1),
     )
+
+
+def act_alone(agent: Agent, observation: Seen) -> np.ndarray:
+    """Return the action of an agent in a single environment, for the observation that this gives."""
+    return agent(each_array(lambda own: own[None, None], observation))[0, 0]
 
 
 def score_run(agent: Agent, batch: EpisodeHost, first: int, options: Options, env: dict[str, Any]) -> None:
@@ -290,7 +293,7 @@ def export_run(run: Run, first: int, options: Options, env: dict[str, Any]) -> N
             (observation, _), over = made.reset(seed=seed), False
             recording.add()
             while not over:
-                observation, _, terminated, truncated, _ = made.step(agent(observation[None, None])[0, 0])
+                observation, _, terminated, truncated, _ = made.step(act_alone(agent, observation))
                 recording.add()
                 over = terminated or truncated
         paths = recording.finish()

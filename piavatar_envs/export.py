@@ -54,14 +54,12 @@ class Recording:
                 hold the colours, or the folder holds something.
         """
         folder = Path(folder)
-        check_format(kind)
-        check_color(color, kind)
+        check_recording(folder, kind, color)
         host = getattr(getattr(env, "unwrapped", None), "host", None)
         if not isinstance(host, EpisodeHost):
             raise ValueError(f"{env} is not of this suite; use an environment or a vector of its ids")
         if index not in range(host.num_envs):
             raise ValueError(f"index={index} is outside [0, {host.num_envs - 1}]")
-        check_folder(folder)
         batch, self._index = host.group_of(index)
         self.writer = film_writer(folder, kind, 1.0 / host.config.physics.control_dt)
         self._scenes, self._color = SceneReader(batch), color
@@ -124,9 +122,7 @@ def export(
     """
     check_agent(agent, seed)
     check_steps(steps)
-    check_format(kind)
-    check_folder(folder)
-    check_color(color, kind)
+    check_recording(folder, kind, color)
     env = make(env_id, settings_of(device, overrides))
     rollout = Rollout()
     try:
@@ -138,25 +134,25 @@ def export(
     return rollout, recording.finish()
 
 
-def check_color(color: str, kind: str) -> None:
-    """Refuse a colour that is unknown, or that a format cannot hold.
+def check_recording(folder: Path, kind: str, color: str = "skin") -> None:
+    """Refuse what cannot be recorded, before an environment is built or played.
+
+    Args:
+        folder: to write to.
+        kind: "glb", "ply" or "usd".
+        color: of the bodies.
 
     Raises:
-        ValueError: it is such a colour.
+        ImportError: usd-core is not installed, for USD.
+        ValueError: an unknown format or colour, a colour that the format cannot hold, or a folder that holds something,
+            that is a file or that cannot be made.
     """
+    check_format(kind)
     known = get_args(BodyColor)
     if color not in known:
         raise ValueError(f"no color {color!r}; use {', '.join(known[:-1])} or {known[-1]}")
     if color != "skin" and kind == "glb":
         raise ValueError(f"color={color} changes with time, which glTF cannot hold; use the format ply or usd")
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that holds something, or that cannot be made.
-
-    Raises:
-        ValueError: it is such a folder, or a file.
-    """
     if folder.is_file():
         raise ValueError(f"{folder} is a file; name a folder")
     if folder.is_dir() and any(folder.iterdir()):

@@ -36,8 +36,9 @@ def test_settings_win_and_a_film_is_written(run_of, device, tmp_path, capsys):
     assert "trained" in capsys.readouterr().out
 
 
-def test_an_episode_is_exported(run_of, device, tmp_path, capsys):
-    line = [str(run_of("ppo")), "episode_seconds=0.1", "--export", str(tmp_path / "film"), "--format", "ply"]
+@pytest.mark.parametrize("kind", ["ppo", "pixels"])
+def test_an_episode_is_exported(kind, run_of, device, tmp_path, capsys):
+    line = [str(run_of(kind)), "episode_seconds=0.1", "--export", str(tmp_path / "film"), "--format", "ply"]
     capsys.readouterr()
     play.main([*line, "--device", device])
     assert "trained" not in capsys.readouterr().out, "an export alone plays no other episodes"
