@@ -22,6 +22,7 @@ from piavatar_envs.tasks import NAMESPACE, instead_of, listed_name
 
 EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")]
 AgentName = Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")]
+Steps = Annotated[int | None, tyro.conf.arg(help="steps to play, over as many episodes; default one episode")]
 Seed = Annotated[int, tyro.conf.arg(help="of the first reset and of the random actions")]
 Device = Annotated[str, tyro.conf.arg(help="where to simulate: cpu, cuda, cuda:1, ...")]
 AvatarFile = Annotated[Path | None, tyro.conf.arg(help="file of a character; its ending chooses avatar.source")]
@@ -92,9 +93,7 @@ def play_command(
     env_id: EnvId,
     agent: AgentName = "random",
     video: Annotated[Path | None, tyro.conf.arg(help="write an .mp4 or .gif (needs the extra render)")] = None,
-    steps: Annotated[
-        int | None, tyro.conf.arg(help="steps to play, over as many episodes; default one episode")
-    ] = None,
+    steps: Steps = None,
     seed: Seed = 0,
     device: Device = "cpu",
     color: Annotated[BodyColor, tyro.conf.arg(help="colour of the body in the video")] = "skin",
@@ -153,12 +152,10 @@ def export_command(
         tyro.conf.arg(help="one animated glTF file, a file for each mesh and frame, or USD (needs the extra usd)"),
     ] = "glb",
     agent: AgentName = "random",
-    steps: Annotated[
-        int | None, tyro.conf.arg(help="steps to play, over as many episodes; default one episode")
-    ] = None,
+    steps: Steps = None,
     seed: Seed = 0,
     device: Device = "cpu",
-    color: Annotated[BodyColor, tyro.conf.arg(help="colour of the bodies; but skin for ply and usd only")] = "skin",
+    color: Annotated[BodyColor, tyro.conf.arg(help="colour of the bodies; glb files have skin only")] = "skin",
     avatar: AvatarFile = None,
     config: Overrides = (),
 ) -> None:

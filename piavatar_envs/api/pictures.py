@@ -182,15 +182,21 @@ class Progress:
 class Picture:
     """Draws environments of a batch with one renderer."""
 
-    def __init__(self, batch: BatchEnv, config: RenderConfig) -> None:
-        """Open the renderer."""
+    def __init__(self, batch: BatchEnv, config: RenderConfig, scenes: SceneReader | None = None) -> None:
+        """Open the renderer.
+
+        Args:
+            batch: holds the environments.
+            config: size and colours.
+            scenes: reads them, if pictures share one.
+        """
         from piavatar_envs.envs.pixels import task_camera
         from piavatar_envs.render import Renderer
 
         self.config = config
         camera = task_camera(batch, batch.task, config.width / config.height)
         self.renderer = Renderer(config.width, config.height, camera, scale=config.overlays)
-        self._scenes = SceneReader(batch)
+        self._scenes = scenes or SceneReader(batch)
 
     def cut(self) -> None:
         """Let the camera jump to the next scene instead of gliding there."""
@@ -218,6 +224,7 @@ class Pictures:
         """
         self._place, self._config = place, config
         self._opened: dict[int, Picture] = {}
+        self._scenes: dict[int, SceneReader] = {}  # by batch
         self._progress: dict[int, Progress] = {}
         self._observers: dict[int, tuple[LaunchGraph, PixelObserver]] = {}  # by batch
 
@@ -229,7 +236,8 @@ class Pictures:
         """
         batch, own = self._place(env)
         if env not in self._opened:
-            self._opened[env], self._progress[env] = Picture(batch, self._config), Progress(batch, own)
+            scenes = self._scenes.setdefault(id(batch), SceneReader(batch))
+            self._opened[env], self._progress[env] = Picture(batch, self._config, scenes), Progress(batch, own)
         elapsed = self._progress[env].since_last()
         if elapsed is None:
             self._opened[env].cut()
@@ -278,6 +286,7 @@ class Pictures:
         for picture in self._opened.values():
             picture.close()
         self._opened.clear()
+        self._scenes.clear()
         self._observers.clear()
 
 

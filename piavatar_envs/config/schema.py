@@ -107,6 +107,8 @@ JointName = Annotated[str, AfterValidator(_check_joint)]
 Place = Annotated[float, Field(ge=-100.0, le=100.0)]
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
+#: Camera that sees a standing person three-quarters from the front: its place and what it looks at [m].
+STANDING_VIEW = (1.75, -3.75, 1.62), (0.0, -0.04, 0.86)
 Component = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Quaternion = Annotated[tuple[Component, Component, Component, Component], AfterValidator(_check_quaternion)]
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
@@ -685,9 +687,9 @@ class PlacedCamera(BaseModel):
 
     kind: Literal["placed"] = Field("placed", description="placed: where position and target say")
     position: Vector = Field(
-        (1.75, -3.75, 1.62), description="the eye, from the ground below what it follows, or from the origin [m]"
+        STANDING_VIEW[0], description="the eye, from the ground below what it follows, or from the origin [m]"
     )
-    target: Vector = Field((0.0, -0.04, 0.86), description="the point that it looks at, from the same origin [m]")
+    target: Vector = Field(STANDING_VIEW[1], description="the point that it looks at, from the same origin [m]")
     follows: bool = Field(True, description="follow the avatars over the ground, or stay at the origin")
 
     @model_validator(mode="after")

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.splats import SplatCloud, constant_colors
 from piavatar_envs.avatar.body.textures import Textures
+from piavatar_envs.config.schema import STANDING_VIEW
 from piavatar_envs.render.markers import placed_mesh, turn_to_direction
 from piavatar_envs.sim.markers import TARGET, WIRE
 
@@ -229,8 +230,8 @@ class Camera:
         follow: share of the distance to the followed point made up in each 1/30 s: 0 stays put, 1 sticks to it.
     """
 
-    position: tuple[float, float, float] = (1.75, -3.75, 1.62)
-    target: tuple[float, float, float] = (0.0, -0.04, 0.86)
+    position: tuple[float, float, float] = STANDING_VIEW[0]
+    target: tuple[float, float, float] = STANDING_VIEW[1]
     field_of_view: float = 29.0
     follow: float = 0.15
 

@@ -438,6 +438,12 @@ def blur_second(
 
 
 @wp.func
+def between(a: float, b: float, c: float, d: float, u: float, v: float) -> float:
+    """Return the value between those of four texels, of which ``b`` and ``d`` lie further along ``v``."""
+    return (1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * c + v * d)
+
+
+@wp.func
 def layer_at(own: Grids, cover: wp.array2d[int], c: int, layer: int, i: int, j: int) -> float:
     """Return the share of a texel of the patch that a layer covers, between the layer's texels."""
     shift = shift_of(layer)
@@ -455,7 +461,7 @@ def layer_at(own: Grids, cover: wp.array2d[int], c: int, layer: int, i: int, j: 
     b = float(cover[c, cell + 1])
     d = float(cover[c, cell + columns])
     e = float(cover[c, cell + columns + 1])
-    return ((1.0 - u) * ((1.0 - v) * a + v * b) + u * ((1.0 - v) * d + v * e)) * _COVER_SCALE
+    return between(a, b, d, e, u, v) * _COVER_SCALE
 
 
 @wp.kernel
@@ -496,11 +502,10 @@ def opacity_at(own: Grids, opacity: wp.array2d[float], c: int, x: float, y: floa
     if u >= 0.0 and v >= 0.0 and u < float(own.patch_rows - 1) and v < float(own.patch_columns - 1):
         i = int(u)
         j = int(v)
-        fu = u - float(i)
-        fv = v - float(j)
         k = i * own.patch_columns + j
-        result = (1.0 - fu) * ((1.0 - fv) * opacity[c, k] + fv * opacity[c, k + 1]) + fu * (
-            (1.0 - fv) * opacity[c, k + own.patch_columns] + fv * opacity[c, k + own.patch_columns + 1]
+        below = k + own.patch_columns
+        result = between(
+            opacity[c, k], opacity[c, k + 1], opacity[c, below], opacity[c, below + 1], u - float(i), v - float(j)
         )
     return result
 
@@ -523,7 +528,7 @@ class Shadows:
         """Allocate the grids.
 
         Args:
-            surfaces: that cast shadows.
+            surfaces: the surfaces that cast shadows.
             pictures: number of pictures ``C`` at a time.
             device: of the surfaces.
         """
@@ -546,7 +551,7 @@ class Shadows:
         """Append the launches that find the shadows of a chunk.
 
         Args:
-            graph: to append to.
+            graph: the graph to append to.
             drawn: which pictures of the chunk change, shape ``(C,)``.
             first: picture of the chunk's first row.
             vertices: of all pictures [m], shape ``(N, V)``.

@@ -263,6 +263,48 @@ def alpha_at(place: wp.vec4, shape: wp.vec4, x: float, y: float) -> float:
     return result
 
 
+@wp.struct
+class Blend:
+    """Part of a splat in the light of a pixel."""
+
+    kind: int  # 0 where it does not reach the pixel, -1 where neither it nor what follows is blended
+    light: wp.vec3  # that it adds
+    left: float  # transmittance behind it
+    in_front: bool  # of the pixel's surface
+
+
+@wp.func
+def blend(
+    records: Records,
+    row: int,
+    i: int,
+    x: float,
+    y: float,
+    transmittance: float,
+    surface: float,
+    behind: float,
+    beside: float,
+) -> Blend:
+    """Return how a sorted splat is blended at a point of the picture, behind those with this transmittance.
+
+    ``surface`` and ``behind`` are inverse depths of the pixel's surface and of what is ``beside`` it, a share [1/m].
+    """
+    result = Blend()
+    alpha = alpha_at(records.place[row, i], records.shape[row, i], x, y)
+    if alpha > 0.0:
+        alpha *= records.share[row, i]
+        tint = records.tint[row, i]
+        result.left = transmittance * (1.0 - alpha)
+        if tint[3] < behind or result.left < _OPAQUE:
+            result.kind = -1
+        else:
+            result.kind = 1
+            result.in_front = tint[3] >= surface
+            share = transmittance * alpha * wp.where(result.in_front, 1.0, beside)
+            result.light = share * wp.vec3(tint[0], tint[1], tint[2])
+    return result
+
+
 @wp.kernel
 def mark_tiles(
     # in
@@ -388,25 +430,18 @@ def blend_tiles(
                     bits = bits & (bits - wp.uint32(1))
                     place = records.place[row, i]
                     if wp.abs(center[0] - place[0]) <= place[2] and wp.abs(center[1] - place[1]) <= place[3]:
-                        alpha = alpha_at(place, records.shape[row, i], center[0], center[1])
-                        if alpha > 0.0:
-                            alpha *= records.share[row, i]
-                            tint = records.tint[row, i]
-                            left = transmittance * (1.0 - alpha)
-                            if tint[3] < behind or left < _OPAQUE:
-                                bits = wp.uint32(0)
-                                some = wp.uint32(0)
-                                at = words.shape[2]
-                            else:
-                                share = transmittance * alpha
-                                if tint[3] < surface:
-                                    share *= beside
-                                else:
-                                    before_surface = left
-                                    if transmittance >= 0.5 and left < 0.5:
-                                        front = i
-                                light += share * wp.vec3(tint[0], tint[1], tint[2])
-                                transmittance = left
+                        part = blend(records, row, i, center[0], center[1], transmittance, surface, behind, beside)
+                        if part.kind < 0:
+                            bits = wp.uint32(0)
+                            some = wp.uint32(0)
+                            at = words.shape[2]
+                        elif part.kind > 0:
+                            if part.in_front:
+                                before_surface = part.left
+                                if transmittance >= 0.5 and part.left < 0.5:
+                                    front = i
+                            light += part.light
+                            transmittance = part.left
             at += 1
         color[picture, y, x] = laid_over(
             light, before_surface, transmittance, color[picture, y, x], beside, backdrop[picture, y, x]
@@ -443,27 +478,30 @@ def blend_splats(
             for x in range(pixels[0], pixels[1] + 1):
                 before = light[row, y, x]
                 if before[3] > 0.0:
-                    alpha = alpha_at(place, records.shape[row, i], float(x) + 0.5, float(y) + 0.5)
-                    if alpha > 0.0:
-                        alpha *= records.share[row, i]
-                        tint = records.tint[row, i]
-                        left = before[3] * (1.0 - alpha)
-                        if tint[3] < backdrop[first + row, y, x][3] or left < _OPAQUE:
-                            light[row, y, x] = wp.vec4(before[0], before[1], before[2], -before[3])
-                        else:
-                            share = before[3] * alpha
-                            if tint[3] < nearest[first + row, y, x]:
-                                share *= 1.0 - coverage[first + row, y, x]
-                            else:
-                                before_surface[row, y, x] = left
-                                if before[3] >= 0.5 and left < 0.5:
-                                    front[row, y, x] = i
-                            light[row, y, x] = wp.vec4(
-                                before[0] + share * tint[0],
-                                before[1] + share * tint[1],
-                                before[2] + share * tint[2],
-                                left,
-                            )
+                    part = blend(
+                        records,
+                        row,
+                        i,
+                        float(x) + 0.5,
+                        float(y) + 0.5,
+                        before[3],
+                        nearest[first + row, y, x],
+                        backdrop[first + row, y, x][3],
+                        1.0 - coverage[first + row, y, x],
+                    )
+                    if part.kind < 0:
+                        light[row, y, x] = wp.vec4(before[0], before[1], before[2], -before[3])
+                    elif part.kind > 0:
+                        if part.in_front:
+                            before_surface[row, y, x] = part.left
+                            if before[3] >= 0.5 and part.left < 0.5:
+                                front[row, y, x] = i
+                        light[row, y, x] = wp.vec4(
+                            before[0] + part.light[0],
+                            before[1] + part.light[1],
+                            before[2] + part.light[2],
+                            part.left,
+                        )
 
 
 @wp.kernel
@@ -531,7 +569,7 @@ class SplatPainter:
             num_pictures: ``N``.
             height: of a picture [px].
             width: of a picture [px].
-            device: to draw on.
+            device: the device to draw on.
             motion: arrays to read means, covariances and turns from; by default own ones.
             subjects: labels of the splats, shape ``(S,)``; 0 by default.
             tiled: whether to draw by tiles; by default on a GPU.

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors
-from piavatar_envs.avatar.body.splats import COEFFICIENTS, SplatCloud, constant_colors
+from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors, dense_weights, top_weights
+from piavatar_envs.avatar.body.sampling import ClosedSurface
+from piavatar_envs.avatar.body.splats import COEFFICIENTS, SkinnedSplats, SplatCloud, constant_colors
 
 _SKIN, _SHIRT, _STRIPE, _TROUSERS = (0.85, 0.65, 0.55), (0.75, 0.15, 0.2), (0.92, 0.9, 0.85), (0.18, 0.25, 0.45)
 
@@ -52,6 +55,14 @@ def on_body(
     return SplatCloud.of(
         means, turns.as_quat(), np.tile([size, size, 0.15 * size], (count, 1)), np.full(count, 0.97), sh
     )
+
+
+def drawn_as(asset: AvatarAsset, cloud: SplatCloud) -> AvatarAsset:
+    """Return a body that is drawn as splats, which move as the nearest points of its skin do."""
+    _, face, at = ClosedSurface(asset.vertices, asset.faces).query(cloud.means)
+    dense = dense_weights(asset.skin_joints, asset.skin_weights)[asset.faces[face]]
+    splats = SkinnedSplats(cloud, *top_weights(np.einsum("sc,scj->sj", at, dense)))
+    return dataclasses.replace(asset, look=dataclasses.replace(asset.drawn, splats=splats))
 
 
 def _colors(rest: np.ndarray) -> np.ndarray:

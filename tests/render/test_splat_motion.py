@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import warp as wp
 from scipy.ndimage import binary_erosion
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import dense_weights, top_weights
-from piavatar_envs.avatar.body.sampling import ClosedSurface, sample_particles
+from piavatar_envs.avatar.body.sampling import sample_particles
 from piavatar_envs.avatar.body.skeleton import forward_kinematics, joint_index, skin
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.body.splats import SkinnedSplats
 from piavatar_envs.avatar.skinning import in_order, pack
 from piavatar_envs.core.arrays import vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -25,7 +21,7 @@ from piavatar_envs.render.splat_motion import STRETCH, BoundSplats, record_turns
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.render.views import Shot, view_rows
-from tests.avatar.splat_clouds import on_body
+from tests.avatar.splat_clouds import drawn_as, on_body
 
 
 class Puppet:
@@ -34,10 +30,7 @@ class Puppet:
     def __init__(self, count: int, device: str, inset: float = 0.0) -> None:
         plain = load_asset()
         cloud = on_body(plain, count, inset=inset)
-        _, face, at = ClosedSurface(plain.vertices, plain.faces).query(cloud.means)
-        dense = dense_weights(plain.skin_joints, plain.skin_weights)[plain.faces[face]]
-        splats = SkinnedSplats(cloud, *top_weights(np.einsum("sc,scj->sj", at, dense)))
-        self.asset = asset = dataclasses.replace(plain, look=dataclasses.replace(plain.drawn, splats=splats))
+        self.asset = asset = drawn_as(plain, cloud)
         self.particles, self.device = sample_particles(plain, 0.05), device
         origin = asset.mean_body().joints[0] - asset.joints[0]
         self.rest = self.particles.rest_positions + origin

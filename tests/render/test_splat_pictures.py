@@ -9,10 +9,8 @@ import pytest
 from scipy.ndimage import binary_dilation
 
 from piavatar_envs.api.pictures import SceneReader
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights
-from piavatar_envs.avatar.body.sampling import ClosedSurface
+from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.sources import load_asset, register_source
-from piavatar_envs.avatar.body.splats import SkinnedSplats
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render.cameras import BatchCamera
 from piavatar_envs.render.coloring import color_by
@@ -23,7 +21,7 @@ from piavatar_envs.render.scene import Camera
 from piavatar_envs.render.stage import Stage
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.render.views import Shot
-from tests.avatar.splat_clouds import on_body
+from tests.avatar.splat_clouds import drawn_as, on_body
 from tests.render.batches import act
 
 SPLATS = {"avatar.source": "body_of_splats"}
@@ -32,11 +30,7 @@ SPLATS = {"avatar.source": "body_of_splats"}
 def with_splats(count: int) -> AvatarAsset:
     """Return the embedded body with splats on its skin."""
     plain = load_asset(appearance="skin")
-    cloud = on_body(plain, count)
-    _, face, at = ClosedSurface(plain.vertices, plain.faces).query(cloud.means)
-    dense = dense_weights(plain.skin_joints, plain.skin_weights)[plain.faces[face]]
-    splats = SkinnedSplats(cloud, *top_weights(np.einsum("sc,scj->sj", at, dense)))
-    return dataclasses.replace(plain, look=dataclasses.replace(plain.drawn, splats=splats))
+    return drawn_as(plain, on_body(plain, count))
 
 
 register_source("body_of_splats", lambda count=20_000: with_splats(count))

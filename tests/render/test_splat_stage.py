@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights
+from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.sources import load_asset, register_source
 from piavatar_envs.avatar.body.splat_files import read_splats
-from piavatar_envs.avatar.body.splats import SkinnedSplats
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.export import Recording
 from piavatar_envs.render.painter import Painter
 from piavatar_envs.render.skin import skin_bytes
 from piavatar_envs.render.stage import Stage, bytes_of_stage
 from piavatar_envs.render.views import Shot, view_rows
-from tests.avatar.splat_clouds import on_body
+from tests.avatar.splat_clouds import drawn_as, on_body
 from tests.render.batches import act
 
 COUNT = 700
@@ -28,11 +25,7 @@ SPLATS = {"avatar.source": "splats_of_tests"}
 def _build() -> AvatarAsset:
     """Return the embedded body, drawn as splats."""
     plain = load_asset(appearance="skin")
-    cloud = on_body(plain, COUNT)
-    _, face, at = ClosedSurface(plain.vertices, plain.faces).query(cloud.means)
-    dense = dense_weights(plain.skin_joints, plain.skin_weights)[plain.faces[face]]
-    splats = SkinnedSplats(cloud, *top_weights(np.einsum("sc,scj->sj", at, dense)))
-    return dataclasses.replace(plain, look=dataclasses.replace(plain.drawn, splats=splats))
+    return drawn_as(plain, on_body(plain, COUNT))
 
 
 @pytest.fixture(autouse=True)
