@@ -42,7 +42,7 @@ class PixelObserver:
 
         Args:
             env: the environments.
-            task: of theirs.
+            task: the task of these environments.
             settings: of the pictures; the task's if not given.
             count: number of environments that are shown, the first ones; all if not given.
 
@@ -150,7 +150,7 @@ def _camera_of(
 
     Args:
         settings: of the pictures.
-        task: whose camera ``"task"`` is.
+        task: the task, whose camera is ``"task"``.
         env: the environments.
         stage: what is seen, one picture an environment.
         agent: index of the agent.
@@ -174,7 +174,7 @@ def task_camera(env: EpisodeArrays, task: Task, aspect: float, field_of_view: fl
 
     Args:
         env: the environments.
-        task: of theirs.
+        task: the task of these environments.
         aspect: width over height of the pictures that it takes.
         field_of_view: vertical angle instead of the camera's own [deg].
     """

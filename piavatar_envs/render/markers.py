@@ -114,7 +114,7 @@ def upload_meshes(
     Args:
         kinds: of the markers.
         sizes: of each [m], up to three numbers.
-        device: where to.
+        device: the device to upload to.
         columns: of each among those that are placed; in the same order if not given.
     """
     columns = np.arange(len(kinds)) if columns is None else np.asarray(columns)

@@ -40,7 +40,7 @@ class Painter:
     vertices and camera alone: equal in every run, and beside any other pictures.
 
     Attributes:
-        surfaces: that are shown.
+        surfaces: the surfaces that are shown.
         vertices: positions [m], shape ``(N, V)``; input. A vertex that is not finite hides its triangles.
         views: cameras, shape ``(N,)``; input.
         centers: points of the ground about which it fades [m], shape ``(N,)``; input.
@@ -76,11 +76,11 @@ class Painter:
         """Allocate the pictures.
 
         Args:
-            surfaces: to show, on the same device.
+            surfaces: the surfaces to show, on the same device.
             num_pictures: ``N``.
             height: of each picture [px].
             width: of each picture [px].
-            device: to draw on.
+            device: the device to draw on.
             samples: along each side of a pixel.
             ground: colours of ground and sky.
             depth: whether to fill :attr:`depth`.

@@ -258,7 +258,7 @@ class Raster:
         """Allocate the samples.
 
         Args:
-            surfaces: that are drawn.
+            surfaces: the surfaces that are drawn.
             pictures: number of pictures ``C`` at a time.
             pixels: of a picture.
             samples: along each side of a pixel.
@@ -276,7 +276,7 @@ class Raster:
         """Append the launches that draw a chunk.
 
         Args:
-            graph: to append to.
+            graph: the graph to append to.
             drawn: which pictures of the chunk change, shape ``(C,)``.
             first: picture of the chunk's first row.
             vertices: of all pictures [m], shape ``(N, V)``.

@@ -236,7 +236,7 @@ class Lighting:
         """Allocate the light.
 
         Args:
-            surfaces: that are lit.
+            surfaces: the surfaces that are lit.
             pictures: number of pictures ``C`` at a time.
             device: of the surfaces.
         """
@@ -254,7 +254,7 @@ class Lighting:
         """Append the launches that light a chunk.
 
         Args:
-            graph: to append to.
+            graph: the graph to append to.
             drawn: which pictures of the chunk change, shape ``(C,)``.
             first: picture of the chunk's first row.
             vertices: of all pictures [m], shape ``(N, V)``.
