@@ -202,7 +202,8 @@ def test_what_is_not_finite_is_left_out(tmp_path, kind):
     else:
         from pxr import Usd, UsdGeom
 
-        seen = UsdGeom.Mesh(Usd.Stage.Open(str(paths[0])).GetPrimAtPath("/film/body_1")).GetVisibilityAttr()
+        stage = Usd.Stage.Open(str(paths[0]))  # prims are valid only while their stage is referenced
+        seen = UsdGeom.Mesh(stage.GetPrimAtPath("/film/body_1")).GetVisibilityAttr()
         assert [seen.Get(frame) for frame in range(3)] == ["invisible", "inherited", "invisible"]
     writer = film_writer(tmp_path / "nothing", kind, RATE)
     with pytest.warns(UserWarning):
