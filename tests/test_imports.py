@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 #: Folders from the ground up; a module may import its own folder and those before it.
-ORDER = ("data", "core", "mpm", "avatar", "config", "sim", "render", "envs", "tasks", "api", "multi")
+ORDER = ("data", "core", "mpm", "avatar", "cloth", "config", "sim", "render", "envs", "tasks", "api", "multi")
 TOP = len(ORDER)
 #: Folders outside the package, and those outside of it that each may import.
 OUTSIDE = {

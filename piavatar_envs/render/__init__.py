@@ -1,5 +1,6 @@
 """Pictures and videos. Pictures need no library but Warp; text on them and videos need the extra ``render``."""
 
+from piavatar_envs.avatar.skin import Skin
 from piavatar_envs.render.overlay import label, side_by_side
 from piavatar_envs.render.quantities import distortion, strain_magnitude
 from piavatar_envs.render.renderer import Renderer
@@ -18,7 +19,6 @@ from piavatar_envs.render.scene import (
     Solid,
     Sphere,
 )
-from piavatar_envs.render.skin import Skin
 from piavatar_envs.render.video import write_video
 
 __all__ = [

@@ -21,12 +21,12 @@ import warp as wp
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.splats import SplatCloud, joined_colors
+from piavatar_envs.avatar.skin import Skin, SkinMotion, SkinSurface, SkinWorkspace, record_skin, skin_workspace
 from piavatar_envs.avatar.skinning import blend_places
 from piavatar_envs.core.arrays import vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.scene import MovedSplats
-from piavatar_envs.render.skin import Skin, SkinMotion, SkinSurface, SkinWorkspace, record_skin, skin_workspace
 from piavatar_envs.sim.world import Simulation
 
 wp.set_module_options({"enable_backward": False})

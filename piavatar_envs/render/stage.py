@@ -15,23 +15,16 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.textures import Textures
+from piavatar_envs.avatar.skin import Skin, SkinMotion, record_skin, skin_bytes, skin_workspace
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.markers import MarkerMeshes, place_markers, unit_mesh, upload_meshes
 from piavatar_envs.render.scene import PALETTE, PROP, Color
-from piavatar_envs.render.skin import (
-    Skin,
-    SkinMotion,
-    SolidSurface,
-    deform_prop,
-    record_skin,
-    skin_bytes,
-    skin_workspace,
-)
 from piavatar_envs.render.splat_motion import BYTES_OF_SPLAT, SplatMotion
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.sim.markers import Markers, MarkerSpec, allocate_markers
+from piavatar_envs.sim.prop_surface import SolidSurface, deform_prop
 from piavatar_envs.sim.world import Simulation
 
 #: Kinds of colliders that are drawn; planes are not.

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.sampling import sample_particles
 from piavatar_envs.avatar.body.skeleton import forward_kinematics, joint_index, skin
 from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.skin import Skin, SkinMotion, record_skin, skin_workspace
 from piavatar_envs.avatar.skinning import in_order, pack
 from piavatar_envs.core.arrays import vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.painter import Painter
-from piavatar_envs.render.skin import Skin, SkinMotion, record_skin, skin_workspace
 from piavatar_envs.render.splat_motion import STRETCH, BoundSplats, record_turns, stencils_of
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces

@@ -9,10 +9,10 @@ from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.sources import load_asset, register_source
 from piavatar_envs.avatar.body.splat_files import read_splats
+from piavatar_envs.avatar.skin import skin_bytes
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.export import Recording
 from piavatar_envs.render.painter import Painter
-from piavatar_envs.render.skin import skin_bytes
 from piavatar_envs.render.stage import Stage, bytes_of_stage
 from piavatar_envs.render.views import Shot, view_rows
 from tests.avatar.splat_clouds import drawn_as, on_body
