@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from piavatar_envs.avatar.body.asset import turned_shares
+from piavatar_envs.avatar.body.eyes import find_eyes
 from piavatar_envs.avatar.body.outfit import KITS
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.body.sources import load_asset
@@ -81,3 +82,29 @@ def test_a_body_of_another_size_is_dressed_as_well(asset):
     )
     hems = [body.drawn.vertices[worn(body.drawn, "shorts"), 2].min() for body in (asset, large)]
     assert hems[1] == pytest.approx(1.3 * hems[0], rel=0.02)
+
+
+def test_eyes_fill_both_sockets_of_every_shape(asset):
+    look = asset.drawn
+    eye = worn(look, "pupils") | worn(look, "irises") | worn(look, "whites")
+    for seed in range(3):
+        parameters = asset.sample_parameters(np.random.default_rng(seed))
+        skin, shown = asset.shape(parameters), asset.shape_drawn(parameters).vertices
+        pupils = shown[worn(look, "pupils")]
+        left, right = (pupils[side * pupils[:, 0] > 0.0].mean(axis=0) for side in (1.0, -1.0))
+        assert np.abs(left - right * [-1.0, 1.0, 1.0]).max() < 0.003 and 0.05 < left[0] - right[0] < 0.07
+        assert cKDTree(skin.vertices).query(shown[eye])[0].max() < 0.014  # a radius, within the sockets
+        front = skin.vertices[np.linalg.norm(skin.vertices[:, [0, 2]] - left[[0, 2]], axis=1) < 0.02, 1].min()
+        assert 0.0 < left[1] - front < 0.012  # behind the brow, before the back of the socket
+
+
+def test_a_face_without_sockets_has_no_eyes(asset):
+    angle, height = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 60), np.linspace(0.0, np.pi, 40))
+    points = np.stack([np.sin(height) * np.sin(angle), np.sin(height) * np.cos(angle), np.cos(height)], -1)
+    corner = np.arange(2400).reshape(40, 60)
+    a, b, c, d = (
+        corner[rows, columns].ravel() for rows in (slice(-1), slice(1, None)) for columns in (slice(-1), slice(1, None))
+    )
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
+    assert find_eyes(0.1 * points.reshape(-1, 3), faces, np.array([0.0, 0.0, -0.06])) == []
+    assert find_eyes(asset.vertices, asset.faces, np.array([0.0, 0.0, 10.0])) == []

@@ -1,4 +1,4 @@
-"""Clothes for a body without any: its skin, cut along seams, in the colours of shirt, shorts and hair; and shoes.
+"""Clothes for a body without any: its skin, cut along seams, in the colours of shirt, shorts and hair; shoes, and eyes.
 
 Every garment is a field over the skin [m]: positive inside, zero on its seam. Triangles are cut where the field is just
 outside and just inside of zero, so that a seam is a clean line however coarse the skin is. Cloth lies a few millimetres
@@ -17,6 +17,7 @@ from scipy import sparse
 from scipy.spatial import ConvexHull, cKDTree
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, Look, area_vectors, dense_weights, top_weights, turned_shares
+from piavatar_envs.avatar.body.eyes import find_eyes
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 
 _SEAM = 0.0012  # half the width over which colour and height change at a seam [m]
@@ -39,7 +40,7 @@ _SIDES = ("left", "right")
 class _Part(IntEnum):
     """Colour of a vertex, counted as the fields of :class:`Kit`."""
 
-    SKIN, HAIR, SHIRT, TRIM, SHORTS, SHOES, SOLES = range(7)
+    SKIN, HAIR, SHIRT, TRIM, SHORTS, SHOES, SOLES, PUPILS, IRISES, WHITES = range(10)
 
 
 @dataclass(frozen=True)
@@ -53,13 +54,24 @@ class Kit:
     shorts: tuple[int, int, int]
     shoes: tuple[int, int, int]
     soles: tuple[int, int, int] = (236, 236, 232)
+    pupils: tuple[int, int, int] = (20, 16, 14)
+    irises: tuple[int, int, int] = (92, 62, 42)
+    whites: tuple[int, int, int] = (238, 234, 228)
 
 
 #: Kits of the avatars of a scene, in their order; the first two differ in lightness, too.
 KITS = (
     Kit((226, 184, 158), (62, 46, 38), (38, 104, 176), (240, 240, 236), (34, 44, 66), (60, 66, 78)),
     Kit((190, 138, 106), (36, 30, 28), (240, 148, 56), (110, 52, 24), (238, 230, 216), (120, 62, 40)),
-    Kit((238, 200, 178), (150, 106, 62), (60, 140, 92), (238, 228, 140), (46, 58, 50), (228, 226, 220)),
+    Kit(
+        (238, 200, 178),
+        (150, 106, 62),
+        (60, 140, 92),
+        (238, 228, 140),
+        (46, 58, 50),
+        (228, 226, 220),
+        irises=(86, 112, 124),
+    ),
     Kit((146, 102, 78), (28, 24, 24), (140, 74, 150), (236, 216, 240), (200, 196, 206), (70, 48, 84)),
 )
 
@@ -83,7 +95,7 @@ def dressed(asset: AvatarAsset) -> Look:
     normals = blend @ _normals(points, asset.faces)
     weights = blend @ dense_weights(asset.skin_joints, asset.skin_weights)
     skin = _Surface(blend @ points + _heights(fields) * normals, faces, _materials(fields), blend, weights)
-    pieces = [skin, *(_shoe(asset, points, at, share, side) for side in _SIDES)]
+    pieces = [skin, *(_shoe(asset, points, at, share, side) for side in _SIDES), *_eyes(asset, at)]
     ends = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     material = np.concatenate([piece.material for piece in pieces])
     joints, values = top_weights(np.concatenate([piece.weights for piece in pieces]))
@@ -285,6 +297,18 @@ def _shoe(
     bound = sparse.csr_array((closeness.ravel(), (rows, own[near.ravel()])), shape=(len(vertices), len(points)))
     weights = bound @ dense_weights(asset.skin_joints, asset.skin_weights)
     return _Surface(vertices, faces, material, bound, weights)
+
+
+def _eyes(asset: AvatarAsset, at: dict[str, np.ndarray]) -> list[_Surface]:
+    """Return the eyeballs of a face with hollow sockets, each of which moves as a whole with the lids around it."""
+    weights, surfaces = dense_weights(asset.skin_joints, asset.skin_weights), []
+    for eye in find_eyes(asset.vertices.astype(np.float64), asset.faces, at["head"]):
+        shape = len(eye.vertices), len(eye.lids)
+        rows, columns = np.repeat(np.arange(shape[0]), shape[1]), np.tile(eye.lids, shape[0])
+        bound = sparse.csr_array((np.full(len(rows), 1.0 / shape[1]), (rows, columns)), (shape[0], len(weights)))
+        material = eye.zone + _Part.PUPILS
+        surfaces.append(_Surface(eye.vertices, eye.faces, material, bound, bound @ weights))
+    return surfaces
 
 
 def _averaged(rows: np.ndarray) -> np.ndarray:
