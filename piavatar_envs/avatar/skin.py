@@ -133,6 +133,8 @@ def pose_skin(envs: wp.array(dtype=int), surface: SkinSurface, motion: SkinMotio
     """Write the pose of the bones of every picture, over ``(pictures, bones)``."""
     i, b = wp.tid()
     e = envs[i]
+    if e < 0:
+        return
     rest = motion.rest_joint[row(e, motion.rest_joint.shape[0]), b]
     workspace.place[i, b] = rigid_matrix(motion.rotation[e, b], rest, motion.position[e, b])
     turn = surface.reference[b]
@@ -162,6 +164,8 @@ def displace_particles(envs: wp.array(dtype=int), surface: SkinSurface, motion: 
     """Write how far the particles are from where the bones put them, over ``(pictures, U)``."""
     i, n = wp.tid()
     e = envs[i]
+    if e < 0:
+        return
     p = surface.used[n]
     rest = motion.rest[row(e, motion.rest.shape[0]), p]
     if surface.start.shape[0] > 1:
@@ -183,7 +187,10 @@ def deform_skin(
 ):
     """Write the vertices of a skin, from vertex ``first`` of every picture on; over ``(pictures, V)``."""
     i, v = wp.tid()
-    rest = with_shape(surface, motion.shape, envs[i], v) + workspace.shift[i]
+    e = envs[i]
+    if e < 0:
+        return
+    rest = with_shape(surface, motion.shape, e, v) + workspace.shift[i]
     if surface.directions.shape[0] > 0:
         for b in range(1, surface.parent.shape[0]):
             change = workspace.change[i, b]
@@ -207,7 +214,7 @@ def record_skin(
 
     Args:
         graph: the launch graph to append to.
-        envs: environment of each picture, ``(pictures,)`` int32.
+        envs: environment of each picture, ``(pictures,)`` int32; a picture of a negative one keeps its vertices.
         surface: from :meth:`Skin.upload`.
         motion: bones and particles.
         workspace: from :func:`skin_workspace`, of as many pictures.

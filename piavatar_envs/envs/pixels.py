@@ -96,7 +96,7 @@ class PixelObserver:
         """
         chosen = self._all if mask is None else mask
         self._task.record_markers(self._env, graph, self.stage.markers)
-        self.stage.record(graph)
+        self.stage.record(graph, chosen)
         for camera, painter in self._eyes:
             camera.record(graph)
             graph.launch(choose, len(painter.drawn), [chosen], [painter.drawn])

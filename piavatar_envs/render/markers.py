@@ -89,6 +89,8 @@ def place_markers(
 ):
     """Write the vertices of the markers, from vertex ``first`` of every picture on; over ``(pictures, V)``."""
     i, v = wp.tid()
+    if envs[i] < 0:
+        return
     m = meshes.marker[v]
     e = row(envs[i], markers.position.shape[0])
     c = meshes.column[m]

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import warp as wp
@@ -27,6 +28,7 @@ from piavatar_envs.core.arrays import vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.scene import MovedSplats
+from piavatar_envs.sim.bodies import Flesh
 from piavatar_envs.sim.world import Simulation
 
 wp.set_module_options({"enable_backward": False})
@@ -103,6 +105,8 @@ def turn_splats(
     """Write covariances and rotations of splats, from ``first`` of every picture on; over ``(pictures, S)``."""
     i, s = wp.tid()
     e = envs[i]
+    if e < 0:
+        return
     # relative to one of the particles, for the slopes add up to zero, and places of the world are large
     turn = wp.mat33()
     origin = motion.x[e, motion.first + surface.used[surface.near[0, s]]]
@@ -230,6 +234,19 @@ def _upload(values: np.ndarray, dtype: type, device: str) -> wp.array:
     return wp.array(np.ascontiguousarray(values, np.float32), dtype=dtype, device=device)
 
 
+#: Splats that :func:`bound_splats` has bound.
+_bound: WeakKeyDictionary[Flesh, BoundSplats] = WeakKeyDictionary()
+
+
+def bound_splats(flesh: Flesh) -> BoundSplats:
+    """Return the splats of an avatar, bound and uploaded once for all pictures of its simulation."""
+    if flesh not in _bound:
+        points, _ = flesh.shaped(flesh.base_parameters)
+        given = flesh.asset, flesh.base_parameters, points.rest[0], points.skin_joints, points.skin_weights
+        _bound[flesh] = BoundSplats.of(*given)
+    return _bound[flesh]
+
+
 class SplatMotion:
     """The splats of all avatars of a simulation that have such, in the environments of some pictures.
 
@@ -246,7 +263,8 @@ class SplatMotion:
 
         Args:
             simulation: the simulated world.
-            envs: environment of each picture, ``(pictures,)`` int32 on its device.
+            envs: environment of each picture, ``(pictures,)`` int32 on its device; splats in that of a negative one
+                stay where they are.
         """
         self.simulation, self.envs, self._device = simulation, envs, simulation.device
         self.bound: dict[int, BoundSplats] = {}
@@ -254,9 +272,7 @@ class SplatMotion:
         first = 0
         for index, flesh in enumerate(simulation.flesh):
             if flesh.asset.drawn.splats is not None:
-                points, _ = flesh.shaped(flesh.base_parameters)
-                given = flesh.asset, flesh.base_parameters, points.rest[0], points.skin_joints, points.skin_weights
-                self.bound[index] = BoundSplats.of(*given)
+                self.bound[index] = bound_splats(flesh)
                 self.slices[index] = slice(first, first + len(self.bound[index].cloud))
                 first = self.slices[index].stop
         shape = (len(envs), first)

@@ -27,6 +27,8 @@ from piavatar_envs.sim.markers import Markers, MarkerSpec, allocate_markers
 from piavatar_envs.sim.prop_surface import SolidSurface, deform_prop
 from piavatar_envs.sim.world import Simulation
 
+wp.set_module_options({"enable_backward": False})
+
 #: Kinds of colliders that are drawn; planes are not.
 _DRAWN_COLLIDERS = ("sphere", "box", "capsule")
 #: Memory of a vertex in a picture [bytes].
@@ -84,6 +86,13 @@ def bytes_of_stage(simulation: Simulation, markers: Sequence[MarkerSpec] = ()) -
     return BYTES_OF_VERTEX * vertices + BYTES_OF_SPLAT * splats + skins
 
 
+@wp.kernel
+def choose_shown(drawn: wp.array[wp.bool], envs: wp.array[int], shown: wp.array[int]):
+    """Write the environments of pictures that change, and -1 for the others; over ``(pictures,)``."""
+    i = wp.tid()
+    shown[i] = wp.where(drawn[i], envs[i], -1)
+
+
 class Stage:
     """Surfaces of a simulation in the environments of some pictures.
 
@@ -118,6 +127,8 @@ class Stage:
         chosen = np.arange(simulation.num_envs) if envs is None else np.asarray(envs)
         self.num_pictures = len(chosen)
         self.envs = wp.array(chosen.astype(np.int32), dtype=int, device=self.device)
+        self._shown = wp.zeros_like(self.envs)
+        self._every = wp.full(self.num_pictures, True, dtype=wp.bool, device=self.device)
         self.parts: list[Part] = []
         names = simulation.subjects.names
         boundaries = simulation.subjects.colliders[: len(simulation.subjects.collider_names)]
@@ -131,7 +142,7 @@ class Stage:
         self.vertices = wp.zeros((self.num_pictures, count), dtype=wp.vec3, device=self.device)
         self.markers = allocate_markers(markers, simulation.num_envs, self.device)
         self._specs = tuple(markers)
-        splats = SplatMotion(simulation, self.envs)
+        splats = SplatMotion(simulation, self._shown)
         self.splats = splats if splats.bound else None
 
     @cached_property
@@ -197,8 +208,15 @@ class Stage:
         name = self.subjects[subject]
         self.parts.append(Part(name, kind, slice(first, first + count), faces, color, colors, textures, subject))
 
-    def record(self, graph: LaunchGraph) -> None:
-        """Append the launches that write the vertices of all pictures from the present state."""
+    def record(self, graph: LaunchGraph, drawn: wp.array | None = None) -> None:
+        """Append the launches that write the vertices of pictures from the present state.
+
+        Args:
+            graph: the graph to append to.
+            drawn: pictures whose vertices change, ``(num_pictures,)`` bool; all if not given.
+        """
+        drawn = self._every if drawn is None else drawn
+        graph.launch(choose_shown, self.num_pictures, [drawn, self.envs], [self._shown])
         if self.splats is not None:
             self.splats.record(graph)
         graph.parallel(self._launches)
@@ -212,7 +230,7 @@ class Stage:
             self._record_skin(graph, avatar, next(first))
         props, x = self.simulation.props, self.simulation.state.x
         for column, (prop, solid) in enumerate(zip(props.props, self.solids, strict=True)):
-            inputs = [self.envs, solid.upload(self.device), prop.first, column, props.state.position]
+            inputs = [self._shown, solid.upload(self.device), prop.first, column, props.state.position]
             inputs += [props.state.rotation, x, next(first)]
             graph.launch(deform_prop, (self.num_pictures, len(solid.vertices)), inputs, [self.vertices])
         if self._colliders:
@@ -237,7 +255,7 @@ class Stage:
             shape=simulation.shapes.parameters(index) if varies else wp.zeros((1, 1), dtype=float, device=self.device),
         )
         workspace = skin_workspace(surface, self.num_pictures, self.device)
-        record_skin(graph, self.envs, surface, motion, workspace, self.vertices, first)
+        record_skin(graph, self._shown, surface, motion, workspace, self.vertices, first)
 
     def _placed_colliders(self) -> Markers:
         """Return the live arrays of all colliders, as markers."""
@@ -254,4 +272,4 @@ class Stage:
     def _record_solids(self, graph: LaunchGraph, meshes: MarkerMeshes, placed: Markers, first: int) -> None:
         """Append the launch that places the meshes of colliders or markers."""
         shape = (self.num_pictures, len(meshes.local))
-        graph.launch(place_markers, shape, [self.envs, meshes, placed, first], [self.vertices])
+        graph.launch(place_markers, shape, [self._shown, meshes, placed, first], [self.vertices])

@@ -43,6 +43,8 @@ def deform_prop(
     """Write the surface of the prop in a ``column``, from vertex ``first`` of every picture on; ``(pictures, V)``."""
     i, v = wp.tid()
     e = envs[i]
+    if e < 0:
+        return
     center = position[e, column]
     turn = wp.quat_to_matrix(rotation[e, column])
     at = turn * surface.vertices[v] + center

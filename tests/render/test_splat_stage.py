@@ -54,6 +54,12 @@ def test_a_row_of_a_batch_is_the_environment_alone(world, make_batch, equal):
     assert np.abs(every[0][0] - every[0][1]).max() > 1e-3
 
 
+def test_pictures_of_a_simulation_share_what_binds_splats(make_batch):
+    batch = make_batch("PIAvatar/Reach-v0", **SPLATS)
+    first, second = (Stage(batch.simulation).splats.bound[0] for _ in range(2))
+    assert first is second and first.upload(batch.device) is second.upload(batch.device)
+
+
 def test_splats_stay_on_the_skin(make_batch):
     batch = make_batch("PIAvatar/Reach-v0", **SPLATS)
     batch.reset(seeds=[0])

@@ -8,6 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body import skeleton
+from piavatar_envs.avatar.body.sources import load_asset, register_source
 from piavatar_envs.config import load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
@@ -16,6 +17,7 @@ from piavatar_envs.render.scene import Ring, Sphere
 from piavatar_envs.render.stage import MARKERS, Stage
 from piavatar_envs.sim.markers import MarkerSpec, turn_to
 from piavatar_envs.tasks.games import load_game_task
+from tests.avatar.splat_clouds import drawn_as, on_body
 from tests.render.batches import act, seen
 
 KICK = "PIAvatar/KickBall-v0"
@@ -46,6 +48,25 @@ def test_a_row_of_a_batch_is_the_environment_alone(kicking, make_batch, equal):
     act(alone, 3, rows=slice(1, 2))
     assert equal(seen(alone)[0], every[1])
     assert equal(seen(kicking), every)
+
+
+@pytest.mark.parametrize("look", [{}, {"avatar.source": "splats_of_tests"}])
+def test_pictures_that_do_not_change_keep_their_vertices(make_batch, equal, look):
+    register_source("splats_of_tests", lambda: drawn_as(load_asset(), on_body(load_asset(), 300)))
+    batch = make_batch(KICK, 3, **SOLIDS, **look)
+    batch.reset(seeds=[7, 8, 9])
+    stage, graph = Stage(batch.simulation, batch.task.marker_specs()), LaunchGraph(batch.device)
+    drawn = wp.array([True, False, True], dtype=wp.bool, device=batch.device)
+    batch.task.record_markers(batch, graph, stage.markers)
+    stage.record(graph, drawn)
+    written = [stage.vertices, *((stage.splats.means, stage.splats.covariances, stage.splats.turns) if look else ())]
+    before = [seen(batch, stage), *(array.numpy().copy() for array in written[1:])]
+    act(batch, 1)
+    graph.run()
+    masked = [array.numpy().copy() for array in written]
+    after = [seen(batch, stage), *(array.numpy() for array in written[1:])]
+    for old, some, new in zip(before, masked, after, strict=True):
+        assert equal(some[1], old[1]) and not equal(old[1], new[1]) and equal(some[[0, 2]], new[[0, 2]])
 
 
 def test_parts_follow_one_another_and_have_labels(kicking):
