@@ -29,6 +29,7 @@ FAILURE_CFL = 4  # too fast for the time step
 FAILURE_ACTION = 8
 FAILURE_BLOCKS = 16
 FAILURE_FORCE = 32  # an external force that is not finite, or one too many
+FAILURE_CLOTH = 64  # a garment's position or velocity that is not finite
 FAILURE_NAMES: dict[int, str] = {
     FAILURE_NONFINITE: "nonfinite",
     FAILURE_OUT_OF_GRID: "out_of_grid",
@@ -36,6 +37,7 @@ FAILURE_NAMES: dict[int, str] = {
     FAILURE_ACTION: "action",
     FAILURE_BLOCKS: "blocks",
     FAILURE_FORCE: "force",
+    FAILURE_CLOTH: "cloth",
 }
 
 #: Largest stable ``c dt / dx`` (measured 0.84 to 1.04, less near incompressibility).

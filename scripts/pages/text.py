@@ -46,6 +46,7 @@ FAILURE_DOCS = {
     "action": "an action was not finite",
     "blocks": "the flesh is spread over more blocks of the grid than have memory",
     "force": "an external force was not finite, or one too many",
+    "cloth": "a garment has moved beyond all bounds",
 }
 USAGE = """```python
 import gymnasium as gym

@@ -276,6 +276,15 @@ def area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return 0.5 * np.cross(b - a, c - a)
 
 
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return unit normals of vertices, the mean of their triangles' by area, shape ``(V, 3)``."""
+    area = area_vectors(vertices, faces)
+    normals = np.zeros((len(vertices), 3))
+    for corner, axis in np.ndindex(3, 3):
+        normals[:, axis] += np.bincount(faces[:, corner], area[:, axis], len(vertices))
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+
 def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Return the volume of a closed, outward oriented triangle mesh [m^3]: signed tetrahedra to the origin."""
     a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))

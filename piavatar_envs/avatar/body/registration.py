@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors, dense_weights
+from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors, dense_weights, vertex_normals
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, blended_maps, bone_maps, forward_kinematics, joint_index
 
@@ -224,15 +224,6 @@ def fit_body(
     starts = sorted(starts, key=lambda fit: _residual(coarse, coarse_cloud, fit))[:_FINALISTS]
     fits = [_refine(fine, cloud, start, _FINE_STEPS, _FINE) for start in starts]
     return min(fits, key=lambda one: _residual(fine, cloud, one))
-
-
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return unit normals of vertices, the mean of their triangles' by area, shape ``(V, 3)``."""
-    area = area_vectors(vertices, faces)
-    normals = np.zeros((len(vertices), 3))
-    for corner, axis in np.ndindex(3, 3):
-        normals[:, axis] += np.bincount(faces[:, corner], area[:, axis], len(vertices))
-    return _unit(normals)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
