@@ -18,7 +18,7 @@ help:
 	@echo "make test-avatars  compare avatars and motions with MakeHuman's data, body-models, pybvh and gsply"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
-	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too; CHECK=1 compares only)"
+	@echo "make docs      write docs/envs/*.md from the code and build the site in build/site (PICTURES=1 draws the pages' pictures, too; CHECK=1 compares the pages only)"
 	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
 
 install: $(STAMP)
@@ -89,8 +89,17 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: install
+# Every warning, such as a link that leads nowhere, is an error.
+docs: install $(if $(CHECK),,$(VENV)/.docs)
 	$(BIN)/python -m scripts.env_pages $(if $(CHECK),--check) $(if $(PICTURES),--pictures)
+ifndef CHECK
+	$(BIN)/python -m sphinx -b html --fail-on-warning --keep-going --quiet docs build/site
+	@echo "built build/site/index.html"
+endif
+
+$(VENV)/.docs: $(STAMP)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --no-build-isolation --editable ".[docs]"
+	@touch $@
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache

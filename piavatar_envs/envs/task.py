@@ -103,6 +103,8 @@ class Columns(tuple):
 class Task:
     """Base of all tasks.
 
+    The page attributes are Markdown for the task's page in ``docs/envs``, which ``python -m scripts.env_pages`` writes.
+
     Class attributes:
         Config: class of the settings.
         description: one line for listings.
@@ -123,7 +125,7 @@ class Task:
             the shape of a picture, unless a task or the settings give them.
         reward_names, cost_names, metric_names: names of the terms and metrics; derived.
 
-    Class attributes for the task's page in ``docs/envs`` (Markdown; ``python -m scripts.env_pages`` writes it):
+    Page attributes:
         summary: a paragraph: the situation, and what a good agent does.
         success_doc: the condition of ``info["success"]``.
         termination_doc: conditions that terminate an episode, besides a released root and a failure; may be empty.
