@@ -1,18 +1,20 @@
 """Surfaces of a glTF file: triangles, skinning and colours, in the pose that the skin was bound in.
 
 Colours are those of the base: factor times vertex colour times texture, which is also sampled at the vertices for
-pictures without textures. Morph targets, normals and every other texture are left out.
+pictures without textures. A texture's opacity makes holes where it is below the cutoff of its material, or below a half
+where the material blends. Morph targets, normals and every other texture are left out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from piavatar_envs.avatar.body.groups import MOST_GROUPS
-from piavatar_envs.avatar.body.textures import CLAMP, MIRROR, REPEAT, Texture, Textures, decoded
+from piavatar_envs.avatar.body.textures import CLAMP, MIRROR, REPEAT, Texture, Textures, decoded, decoded_alpha
 from piavatar_envs.avatar.gltf import MAX_VALUES, Gltf, numbers, whole
 from piavatar_envs.core.extras import install_command
 from piavatar_envs.core.reading import UNREADABLE, first_line, reading
@@ -179,8 +181,8 @@ class _Reader:
     gltf: Gltf
     notes: list[str] = field(default_factory=list)
     _arrays: dict[int, np.ndarray] = field(default_factory=dict)
-    _textures: dict[int, Texture | None] = field(default_factory=dict)
-    _images: dict[int, np.ndarray | None] = field(default_factory=dict)
+    _textures: dict[tuple[int, float | None], Texture | None] = field(default_factory=dict)
+    _images: dict[tuple[int, bool], np.ndarray | None] = field(default_factory=dict)
 
     def pieces(self) -> list[Piece]:
         """Return the triangles of all nodes that are shown."""
@@ -319,20 +321,32 @@ class _Reader:
                 raise ValueError(f"COLOR_0 of the {what} has shape {stored.shape} for {count} vertices")
             linear = linear * stored[used, :3]
         tints = np.round(255.0 * linear_to_srgb(linear)).astype(np.uint8)
-        placed = None if texture is None else self.placed(texture, attributes, used, count, what)
+        placed = None
+        if texture is not None:
+            opacity = 1.0 if factor is None else float(factor[3])
+            placed = self.placed(texture, self.cutoff(material, opacity), attributes, used, count, what)
         if placed is None:
             return tints, None
         textures = Textures((placed[0],), np.zeros(len(faces), np.int32), placed[1].astype(np.float32), tints)
         return textures.colors(faces), textures
 
+    def cutoff(self, material: dict[str, Any], opacity: float) -> float | None:
+        """Return the opacity of a texture below which a material of an opacity has holes; None where it has none."""
+        mode = material.get("alphaMode")
+        if mode not in ("MASK", "BLEND"):
+            return None
+        given = material.get("alphaCutoff", 0.5) if mode == "MASK" else 0.5
+        return float(numbers([given], 1, "alphaCutoff of a material")[0] / max(opacity, 1e-6))
+
     def placed(
-        self, info: dict[str, Any], attributes: dict[str, Any], used: np.ndarray, count: int, what: str
-    ) -> tuple[Texture, np.ndarray] | None:
+        self, info: dict[str, Any], cutoff: float | None, attributes: dict[str, Any], used: np.ndarray, count: int,
+        what: str,
+    ) -> tuple[Texture, np.ndarray] | None:  # fmt: skip
         """Return a texture, and the places of the vertices in it, ``(V, 2)``; None where it cannot be read."""
         number = whole(info.get("index"), "index of a texture", len(self.gltf.items("textures")) - 1)
-        if number not in self._textures:
-            self._textures[number] = self.texture(number)
-        texture = self._textures[number]
+        if (number, cutoff) not in self._textures:
+            self._textures[number, cutoff] = self.texture(number, cutoff)
+        texture = self._textures[number, cutoff]
         moved = (info.get("extensions") or {}).get("KHR_texture_transform") or {}
         channel = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
         if texture is None or channel not in attributes:
@@ -346,8 +360,8 @@ class _Reader:
         uv = uv @ np.array([[cos, -sin], [sin, cos]]) + numbers(moved.get("offset", (0, 0)), 2, "offset of a texture")
         return texture, np.clip(uv, -MAX_UV, MAX_UV)
 
-    def texture(self, number: int) -> Texture | None:
-        """Return a texture; None, and a note, where it cannot be read."""
+    def texture(self, number: int, cutoff: float | None) -> Texture | None:
+        """Return a texture, with holes below a cutoff; None, and a note, where it cannot be read."""
         entry = self.gltf.item("textures", number)
         source = ((entry.get("extensions") or {}).get("EXT_texture_webp") or entry).get("source")
         if source is None:
@@ -355,28 +369,38 @@ class _Reader:
             return None
         sampler = entry.get("sampler")
         wraps = {} if sampler is None else self.gltf.item("samplers", sampler)
-        if source not in self._images:
-            self._images[source] = self.image(source, number)
-        pixels = self._images[source]
+        pixels = self.image(source, number)
         across, down = (wraps.get(key, REPEAT) for key in ("wrapS", "wrapT"))
         known = (REPEAT, CLAMP, MIRROR)
         if pixels is None:
             return None
-        return Texture(pixels, (across if across in known else REPEAT, down if down in known else REPEAT))
+        inside = across if across in known else REPEAT, down if down in known else REPEAT
+        if cutoff is None:
+            return Texture(pixels, inside)
+        return Texture(pixels, inside, self.image(source, number, alpha=True), cutoff)
 
-    def image(self, source: int, number: int) -> np.ndarray | None:
-        """Return the pixels of the image of a texture, ``(H, W, 3)`` uint8; None, and a note, where it is not read."""
+    def image(self, source: int, number: int, alpha: bool = False) -> np.ndarray | None:
+        """Return the pixels of the image of a texture, ``(H, W, 3)`` uint8, or its opacity, ``(H, W)``; read once.
+
+        None where it has no opacity, and, with a note, where it cannot be read.
+        """
+        if (source, alpha) not in self._images:
+            self._images[source, alpha] = self.read_image(source, number, decoded_alpha if alpha else decoded)
+        return self._images[source, alpha]
+
+    def read_image(self, source: int, number: int, read: Callable[[bytes], np.ndarray | None]) -> np.ndarray | None:
+        """Return what ``read`` makes of the file of an image; None, and a note, where it is not read."""
         image = self.gltf.item("images", source)
         what = f"image {source}"
         try:
-            if len(self._images) >= MAX_IMAGES:
+            if len({known for known, _ in self._images} | {source}) > MAX_IMAGES:
                 raise ValueError(f"the file has more than {MAX_IMAGES} images of base colours")
             content = (
                 self.gltf.resource(image["uri"], what)
                 if "uri" in image
                 else self.gltf.buffer_view(image["bufferView"], what)
             )
-            return decoded(content)
+            return read(content)
         except ImportError:
             self.notes.append(f"textures are left out, for want of Pillow: {install_command('render')}")
         except UNREADABLE as error:

@@ -113,7 +113,7 @@ class _Glb:
         if find_spec("PIL") is None:
             return None
         if id(texture) not in self._materials:
-            view = self._add_view(encoded(texture.pixels))
+            view = self._add_view(encoded(texture))
             wraps = dict(zip(("wrapS", "wrapT"), texture.wraps, strict=True))
             source = {
                 "source": self._append("images", {"bufferView": view, "mimeType": "image/png"}),
@@ -121,7 +121,8 @@ class _Glb:
             }
             base = {"baseColorTexture": {"index": self._append("textures", source)}}
             plain = self.document["materials"][0]["pbrMetallicRoughness"]
-            self._materials[id(texture)] = self._append("materials", {"pbrMetallicRoughness": plain | base})
+            holes = {} if texture.alpha is None else {"alphaMode": "MASK", "alphaCutoff": texture.cutoff}
+            self._materials[id(texture)] = self._append("materials", {"pbrMetallicRoughness": plain | base} | holes)
         return self._materials[id(texture)]
 
     def _append(self, key: str, item: dict[str, Any]) -> int:
@@ -251,7 +252,8 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 def glb_size(film: Film) -> int:
     """Return how large the file of a film is at most [bytes], by what :func:`_add_mesh` writes."""
     frames, meshes = film.num_frames, film.meshes
-    images = {id(image): image.pixels.nbytes for mesh in meshes if mesh.textures for image in mesh.textures.images}
+    every = [image for mesh in meshes if mesh.textures for image in mesh.textures.images]
+    images = {id(image): image.pixels.nbytes + (0 if image.alpha is None else image.alpha.nbytes) for image in every}
     size = _MESH_TEXT * (1 + len(images)) + 4 * frames + sum(images.values())
     for mesh in meshes:
         vertex = 12 + 12 + 8 + 8 + 24 * mesh.changes  # position, normal, colour, uv; displacements of the first two

@@ -9,6 +9,7 @@ import warp as wp
 from piavatar_envs.config.schema import LEAST_PICTURE
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
+from piavatar_envs.render.cutouts import record_cutouts
 from piavatar_envs.render.ground import Ground, GroundStyle
 from piavatar_envs.render.raster import Raster
 from piavatar_envs.render.resolve import Paint, resolve, to_bytes
@@ -146,6 +147,9 @@ class Painter:
         shadows.record(graph, drawn, first, vertices, self._threads)
         lighting.record(graph, drawn, first, vertices, views, shadows, self._threads)
         raster.record(graph, drawn, first, vertices, views, shadows.areas, self._threads)
+        record_cutouts(
+            graph, surfaces, self._samples, drawn, first, vertices, views, shadows.areas, raster.nearest, self._threads
+        )
         k = self._threads(self.height * self.width)
         graph.launch(
             resolve,

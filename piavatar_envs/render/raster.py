@@ -111,6 +111,32 @@ def edge(p: wp.vec3, q: wp.vec3, x: float, y: float) -> float:
 
 
 @wp.func
+def hit_in_plane(frame: Frame, x: float, y: float) -> wp.vec4:
+    """Return the corners' weights in the plane of the picture, without scale, and the inverse depth; 0 beside it."""
+    wa = edge(frame.b, frame.c, x, y)
+    wb = edge(frame.c, frame.a, x, y)
+    wc = edge(frame.a, frame.b, x, y)
+    inverse = float(0.0)
+    if wp.min(wa, wp.min(wb, wc)) >= 0.0:
+        total = wa + wb + wc
+        if total > 0.0:
+            inverse = (wa * frame.a[2] + wb * frame.b[2] + wc * frame.c[2]) / total
+    return wp.vec4(wa, wb, wc, inverse)
+
+
+@wp.func
+def hit_by_ray(a: wp.vec3, b: wp.vec3, c: wp.vec3, volume: float, ray: wp.vec3) -> wp.vec4:
+    """Return the corners' weights where a ray of forward component 1 meets a triangle, likewise but in space."""
+    ua = wp.dot(wp.cross(b, c), ray)
+    ub = wp.dot(wp.cross(c, a), ray)
+    uc = wp.dot(wp.cross(a, b), ray)
+    inverse = (ua + ub + uc) / volume
+    if not (wp.min(ua, wp.min(ub, uc)) >= 0.0 and inverse <= _MOST):
+        inverse = 0.0
+    return wp.vec4(ua, ub, uc, inverse)
+
+
+@wp.func
 def keep_nearest(nearest: wp.array2d[wp.uint64], c: int, sample: int, inverse: float, triangle: int):
     """Show a triangle at a sample if nothing nearer is there."""
     key = (wp.uint64(wp.cast(inverse, wp.uint32)) << wp.uint64(32)) | wp.uint64(triangle + 1)
@@ -141,15 +167,9 @@ def draw(
             py = float(y) + 0.5
             x = frame.left + lane
             while x <= frame.right:
-                px = float(x) + 0.5
-                wa = edge(frame.b, frame.c, px, py)
-                wb = edge(frame.c, frame.a, px, py)
-                wc = edge(frame.a, frame.b, px, py)
-                if wp.min(wa, wp.min(wb, wc)) >= 0.0:
-                    total = wa + wb + wc
-                    if total > 0.0:
-                        inverse = (wa * frame.a[2] + wb * frame.b[2] + wc * frame.c[2]) / total
-                        keep_nearest(nearest, picture, y * width + x, inverse, triangle)
+                hit = hit_in_plane(frame, float(x) + 0.5, py)
+                if hit[3] > 0.0:
+                    keep_nearest(nearest, picture, y * width + x, hit[3], triangle)
                 x += lanes
     else:
         scale = 1.0 / (float(samples) * view.focal)
@@ -158,13 +178,9 @@ def draw(
             for x in range(frame.left + lane, frame.right + 1, lanes):
                 px = (float(x) + 0.5 - 0.5 * float(width)) * scale
                 py = (0.5 * float(samples * view.height) - float(y) - 0.5) * scale
-                ray = wp.vec3(px, py, 1.0)
-                ua = wp.dot(wp.cross(b, c), ray)
-                ub = wp.dot(wp.cross(c, a), ray)
-                uc = wp.dot(wp.cross(a, b), ray)
-                inverse = (ua + ub + uc) / volume
-                if wp.min(ua, wp.min(ub, uc)) >= 0.0 and inverse > 0.0 and inverse <= _MOST:
-                    keep_nearest(nearest, picture, y * width + x, inverse, triangle)
+                hit = hit_by_ray(a, b, c, volume, wp.vec3(px, py, 1.0))
+                if hit[3] > 0.0:
+                    keep_nearest(nearest, picture, y * width + x, hit[3], triangle)
 
 
 @wp.kernel
@@ -177,7 +193,7 @@ def draw_triangles(
     large: int,
     views: wp.array[View],
     triangles: wp.array[wp.vec3i],
-    subject: wp.array[int],  # -1 of triangles that are not drawn
+    whole: wp.array[wp.bool],  # triangles that are drawn, and have no holes
     vertices: wp.array2d[wp.vec3],  # [m], (N, V)
     areas: wp.array2d[wp.vec3],  # outward normals times area, zero where hidden, (C, T)
     # in, out
@@ -199,7 +215,7 @@ def draw_triangles(
         p = wp.vec3()
         q = wp.vec3()
         r = wp.vec3()
-        if wp.dot(areas[c, t], view.eye - a) > 0.0 and subject[t] >= 0:
+        if wp.dot(areas[c, t], view.eye - a) > 0.0 and whole[t]:
             p = to_camera(view, a)
             q = to_camera(view, vertices[n, corner[1]])
             r = to_camera(view, vertices[n, corner[2]])
@@ -290,7 +306,7 @@ class Raster:
         graph.launch(
             draw_triangles,
             (count, k),
-            [drawn, first, k, self._samples, large, views, triangles, self._surfaces.subject, vertices, areas],
+            [drawn, first, k, self._samples, large, views, triangles, self._surfaces.whole, vertices, areas],
             [self.nearest, self.num_large, self._large],
         )
         if self._shares:

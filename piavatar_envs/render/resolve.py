@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.body import textures
 from piavatar_envs.render.ground import Ground, checker, ground_at, ground_share
 from piavatar_envs.render.shading import to_srgb
 from piavatar_envs.render.shadows import Grids, opacity_at
+from piavatar_envs.render.texels import level_of, texels_around
 from piavatar_envs.render.views import View, ray_at, rays_of
 
 wp.set_module_options({"enable_backward": False})
-
-CLAMP, MIRROR = wp.constant(textures.CLAMP), wp.constant(textures.MIRROR)
 
 
 @wp.struct
@@ -41,41 +39,17 @@ def texel_at(texels: wp.array3d[wp.uint8], texture: int, cell: int) -> wp.vec3:
 
 
 @wp.func
-def wrapped(cell: int, size: int, wrap: int) -> int:
-    """Return the row or column of a texture, of a power of two of them, that is shown where it may be beyond."""
-    if wrap == CLAMP:
-        return wp.clamp(cell, 0, size - 1)
-    if wrap == MIRROR:
-        folded = cell & (2 * size - 1)
-        return wp.min(folded, 2 * size - 1 - folded)
-    return cell & (size - 1)
-
-
-@wp.func
 def textured(paint: Paint, texture: int, uv: wp.vec2, texels_a_pixel: float) -> wp.vec3:
     """Return the linear base colour of a texture between the texels of the level that fits the pixels."""
-    size = int(paint.texture_size)
-    first = int(0)
-    while size > 1 and texels_a_pixel * float(size * size) > 2.0 * float(paint.texture_size * paint.texture_size):
-        first += size * size
-        size = size // 2
-    x = uv[0] * float(size) - 0.5
-    y = uv[1] * float(size) - 0.5
-    column = int(wp.floor(x))
-    row = int(wp.floor(y))
-    fx = x - float(column)
-    fy = y - float(row)
-    across = paint.wraps[texture, 0]
-    down = paint.wraps[texture, 1]
-    left = wrapped(column, size, across)
-    right = wrapped(column + 1, size, across)
-    top = first + wrapped(row, size, down) * size
-    bottom = first + wrapped(row + 1, size, down) * size
+    around = texels_around(level_of(paint.texture_size, texels_a_pixel), paint.wraps, texture, uv)
+    fx = around.across
+    fy = around.down
     color = (1.0 - fy) * (
-        (1.0 - fx) * texel_at(paint.texels, texture, top + left) + fx * texel_at(paint.texels, texture, top + right)
+        (1.0 - fx) * texel_at(paint.texels, texture, around.upper_left)
+        + fx * texel_at(paint.texels, texture, around.upper_right)
     ) + fy * (
-        (1.0 - fx) * texel_at(paint.texels, texture, bottom + left)
-        + fx * texel_at(paint.texels, texture, bottom + right)
+        (1.0 - fx) * texel_at(paint.texels, texture, around.lower_left)
+        + fx * texel_at(paint.texels, texture, around.lower_right)
     )
     color = color / 255.0
     return wp.vec3(to_linear(color[0]), to_linear(color[1]), to_linear(color[2]))

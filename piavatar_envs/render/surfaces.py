@@ -11,6 +11,7 @@ import warp as wp
 from piavatar_envs.avatar.body.textures import REPEAT, TEXTURE_SIDE, Textures, joined
 from piavatar_envs.core.srgb import srgb_to_linear
 from piavatar_envs.render.scene import CLAY, Color
+from piavatar_envs.render.texels import alpha_levels, color_levels
 
 #: Memory of all textures on the device [bytes], which are reduced until they fit: 32 of the largest side do.
 _MOST_BYTES = 2**27
@@ -75,6 +76,9 @@ class Surfaces:
         wraps: how each texture goes on beyond its borders, see :class:`Texture`, shape ``(K, 2)``.
         texture_size: side of the textures [texels], a power of two.
         subject: label of each triangle, -1 of one that is not drawn, shape ``(T,)``.
+        whole: whether each triangle is drawn and has no holes, shape ``(T,)`` bool.
+        cutouts: drawn triangles with holes and the row of each in :attr:`alpha`, shape ``(M,)``.
+        alpha: levels of the textures with holes, which are where it is below ``texels.OPAQUE``, shape ``(A, n)`` uint8.
     """
 
     num_vertices: int
@@ -90,6 +94,9 @@ class Surfaces:
     wraps: wp.array
     texture_size: int
     subject: wp.array
+    whole: wp.array
+    cutouts: wp.array
+    alpha: wp.array
 
     @classmethod
     def build(cls, meshes: Sequence[MeshPart], device: str | wp.Device, num_albedos: int = 1) -> Surfaces:
@@ -129,7 +136,12 @@ class Surfaces:
         size = _side(images)
         incident = _incident(triangles, int(first[-1]))
         neighbours = _neighbours(triangles, int(first[-1]))
-        texels = np.stack([_levels(_resized(image, size)) for image in images])
+        texels = np.stack([color_levels(image, size) for image in images])
+        clear = [index for index, texture in enumerate(textures.images) if texture.alpha is not None]
+        alpha = [alpha_levels(textures.images[index].alpha, textures.images[index].cutoff, size) for index in clear]
+        is_drawn, has_holes = np.concatenate(labels) >= 0, np.isin(textures.image, clear)
+        holed = np.flatnonzero(is_drawn & has_holes)
+        rows = np.searchsorted(clear, textures.image[holed])
         wraps = np.array([texture.wraps for texture in textures.images] or [(REPEAT, REPEAT)], np.int32)
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:
@@ -151,6 +163,9 @@ class Surfaces:
             wraps=upload(wraps, wp.int32),
             texture_size=size,
             subject=upload(np.concatenate(labels).astype(np.int32), wp.int32),
+            whole=upload(is_drawn & ~has_holes, wp.bool),
+            cutouts=wp.array(np.stack([holed, rows], axis=1).astype(np.int32), dtype=wp.vec2i, device=device),
+            alpha=upload(np.stack(alpha) if alpha else np.zeros((0, 1), np.uint8), wp.uint8),
         )
 
 
@@ -195,28 +210,3 @@ def _side(images: Sequence[np.ndarray]) -> int:
     while side > 1 and 4 * side * side * len(images) > _MOST_BYTES:
         side //= 2
     return side
-
-
-def _resized(image: np.ndarray, size: int) -> np.ndarray:
-    """Return an image at ``size`` by ``size`` texels, averaged where it shrinks, shape ``(size, size, 3)`` float."""
-    values = np.asarray(image, dtype=np.float32)
-    for axis in (0, 1):
-        length = values.shape[axis]
-        # The integral of the image between the edges of the new texels, over their width.
-        total = np.concatenate([np.zeros_like(values.take([0], axis)), np.cumsum(values, axis, np.float64)], axis)
-        edges = np.linspace(0.0, length, size + 1)
-        low = np.minimum(edges.astype(int), length - 1)
-        share = (edges - low).reshape([-1 if axis == each else 1 for each in range(3)])
-        at_edges = total.take(low, axis) * (1.0 - share) + total.take(low + 1, axis) * share
-        values = (np.diff(at_edges, axis=axis) * (size / length)).astype(np.float32)
-    return values
-
-
-def _levels(image: np.ndarray) -> np.ndarray:
-    """Return a square image and its halves down to one texel, one after the other, shape ``(n, 3)`` uint8."""
-    levels = [image]
-    while len(levels[-1]) > 1:
-        side = len(levels[-1]) // 2
-        levels.append(levels[-1].reshape(side, 2, side, 2, 3).mean(axis=(1, 3)))
-    flat = np.concatenate([level.reshape(-1, 3) for level in levels])
-    return np.clip(np.rint(flat), 0, 255).astype(np.uint8)

@@ -41,14 +41,15 @@ def front(points: np.ndarray) -> np.ndarray:
     return np.stack([0.5 + points[:, 0] / (20 * FIELD), 1.0 - points[:, 2] / (20 * FIELD)], axis=1)
 
 
-def checkered(folder, **fields):
-    """Write a character in a checker, with hair of a plain colour."""
+def checkered(folder, pixels=None, more=None, opacity=1, **fields):
+    """Write a character in a checker, or another image, with hair of a plain colour."""
     asset = load_asset()
     rig = rig_of(asset, named("mixamo"), parts=dressed(asset)[:1], **fields)
     rig.attributes["TEXCOORD_0"] = (front(rig.vertices).astype("<f4"), "VEC2")
-    rig.material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 0.5, 1, 1]}}
+    rig.material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 0.5, 1, opacity]}}
+    rig.material |= more or {}
     out = rig.write()
-    out.add("images", {"bufferView": out.view(png(checker())), "mimeType": "image/png"})
+    out.add("images", {"bufferView": out.view(png(checker() if pixels is None else pixels)), "mimeType": "image/png"})
     out.add("samplers", {"wrapS": 33071, "wrapT": 33648})
     out.add("textures", {"source": 0, "sampler": 0})
     return out.save(folder / "checkered.glb")
@@ -93,6 +94,33 @@ def test_worn_surfaces_have_their_texture_on_both_sides():
     np.testing.assert_array_equal(look.textures.uv[outer], look.textures.uv[inner[:, ::-1]])
     with pytest.raises(ValueError, match=f"textures of {len(places)} vertices and {count - 1} triangles"):
         body_of(dataclasses.replace(worn, textures=textures.chosen(np.arange(len(places)), np.arange(count - 1))))
+
+
+@pytest.mark.parametrize(
+    ("material", "cutoff"),
+    [
+        ({}, None),
+        ({"alphaMode": "OPAQUE", "alphaCutoff": 0.2}, None),
+        ({"alphaMode": "MASK"}, 0.5),
+        ({"alphaMode": "MASK", "alphaCutoff": 0.2}, 0.2),
+        ({"alphaMode": "BLEND", "alphaCutoff": 0.2}, 0.5),
+    ],
+)
+def test_materials_say_where_a_texture_has_holes(tmp_path, material, cutoff):
+    """Opacity counts where the material says so, as a share of its own; the colours beneath it are kept."""
+    opacity = np.linspace(0, 255, 160).astype(np.uint8)[None].repeat(160, 0)
+    path = checkered(tmp_path, pixels=np.dstack([checker(), opacity]), more=material, opacity=0.8)
+    (texture,) = body_of(read_character(path)).look.textures.images
+    assert np.array_equal(texture.pixels, checker())
+    if cutoff is None:
+        assert texture.alpha is None
+    else:
+        assert np.array_equal(texture.alpha, opacity) and texture.cutoff == pytest.approx(cutoff / 0.8)
+
+
+def test_images_without_opacity_have_no_holes(tmp_path):
+    (texture,) = body_of(read_character(checkered(tmp_path, more={"alphaMode": "MASK"}))).look.textures.images
+    assert texture.alpha is None
 
 
 def test_a_look_with_fewer_triangles_has_colours_only(character, monkeypatch):

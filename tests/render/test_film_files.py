@@ -92,6 +92,20 @@ def test_gltf_keeps_colours_triangles_and_smooth_normals(tmp_path):
     assert (np.einsum("vi,vi->v", normals, radii) > 0.97).all()
 
 
+def test_gltf_has_holes(tmp_path):
+    pytest.importorskip("PIL", reason="needs the extra render")
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 255, (2, 5, 7, 3)).astype(np.uint8)
+    images = Texture(pixels[0], alpha=pixels[1, ..., 0], cutoff=0.3), Texture(pixels[0])
+    textures = Textures(images, np.array([1, 1, 0, 0]), np.zeros((4, 2), np.float32), COLORS)
+    (path,) = write(tmp_path, "glb", colors=textures.colors(FACES), textures=textures)
+    whole, holed = (piece.textures.images[0] for piece in read_surfaces(read_gltf(path)).pieces[:2])
+    if whole.alpha is not None:
+        whole, holed = holed, whole
+    assert whole.alpha is None and holed.cutoff == 0.3 and np.array_equal(holed.alpha, images[0].alpha)
+    assert np.array_equal(holed.pixels, images[0].pixels)
+
+
 def test_gltf_has_textures(tmp_path):
     pytest.importorskip("PIL", reason="needs the extra render")
     rng = np.random.default_rng(0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,10 +24,23 @@ class Texture:
     Attributes:
         pixels: sRGB, shape ``(h, w, 3)`` uint8.
         wraps: how it goes on beside its left and right border, and above and below.
+        alpha: opacity of the pixels, shape ``(h, w)`` uint8; None where all are opaque.
+        cutoff: opacity below which there is a hole, as a share of the largest.
     """
 
     pixels: np.ndarray
     wraps: tuple[int, int] = (REPEAT, REPEAT)
+    alpha: np.ndarray | None = None
+    cutoff: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse an opacity that does not fit the pixels.
+
+        Raises:
+            ValueError: it does not.
+        """
+        if self.alpha is not None and self.alpha.shape != self.pixels.shape[:2]:
+            raise ValueError(f"alpha has shape {self.alpha.shape}; give one value a pixel: {self.pixels.shape[:2]}")
 
     def at(self, uv: np.ndarray) -> np.ndarray:
         """Return linear colours between the pixels, shape ``(N, 3)``.
@@ -126,26 +139,44 @@ def decoded(content: bytes) -> np.ndarray:
         OSError: the image is damaged, or in a format that Pillow does not read.
         ValueError: it has more than :data:`MAX_PIXELS`.
     """
+    return _opened(content, reduced)
+
+
+def decoded_alpha(content: bytes) -> np.ndarray | None:
+    """Return the opacity of an image file as :func:`decoded` its pixels, shape ``(h, w)`` uint8; None without one.
+
+    The colours beneath what is transparent are kept by reading them apart.
+    """
+
+    def read(picture: Any) -> np.ndarray | None:
+        clear = "A" in picture.getbands() or "transparency" in picture.info
+        return reduced(picture, "A") if clear else None
+
+    return _opened(content, read)
+
+
+def _opened(content: bytes, read: Callable[[Any], Any]) -> Any:
+    """Return what ``read`` makes of an image file; errors as for :func:`decoded`."""
     from PIL import Image
 
     try:
         with Image.open(io.BytesIO(content)) as picture:
-            return reduced(picture)
+            return read(picture)
     except Image.DecompressionBombError as error:
         raise ValueError(str(error)) from None
 
 
-def reduced(picture: Any) -> np.ndarray:
-    """Return the pixels of an image of Pillow that was opened; errors as for :func:`decoded`."""
+def reduced(picture: Any, channel: str | None = None) -> np.ndarray:
+    """Return the pixels of an image of Pillow that was opened, or a channel of them; errors as for :func:`decoded`."""
     if picture.width * picture.height > MAX_PIXELS:
         raise ValueError(f"it has {picture.width} x {picture.height} pixels, more than {MAX_PIXELS}")
-    picture = picture.convert("RGB")
+    picture = picture.convert("RGBA").getchannel(channel) if channel else picture.convert("RGB")
     picture.thumbnail((TEXTURE_SIDE, TEXTURE_SIDE))
     return np.asarray(picture)
 
 
-def encoded(pixels: np.ndarray) -> bytes:
-    """Return an image as a PNG file.
+def encoded(texture: Texture) -> bytes:
+    """Return a texture as a PNG file, with its opacity.
 
     Raises:
         ImportError: Pillow is not installed.
@@ -153,7 +184,8 @@ def encoded(pixels: np.ndarray) -> bytes:
     from PIL import Image
 
     stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "PNG")
+    opacity = () if texture.alpha is None else (texture.alpha[..., None],)
+    Image.fromarray(np.concatenate([texture.pixels, *opacity], axis=2)).save(stream, "PNG")
     return stream.getvalue()
 
 
