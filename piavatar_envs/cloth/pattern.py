@@ -1,0 +1,153 @@
+"""Flat patterns: flared panels as sectors of an annulus, which hang from any closed convex curve around a body.
+
+A sector of an annulus is bent without stretch around a convex curve C(s) with outward normal n(s), if its inner arc is
+as long as the curve: ``C(s) + f (r - r0) n - sqrt(1 - f^2) (r - r0) z``, where f is the sector's angle over a full turn
+and r0 the inner radius. Its rulings are straight and all points of one pattern ring are equally low, so that the surface
+is developable (do Carmo, "Differential Geometry of Curves and Surfaces", 1976, sec. 3-5) and rest lengths are those of
+the flat sheet. For f beyond :data:`STEEPEST` the cloth falls into folds, which the drape settles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+#: Height of a row of equilateral triangles over their side.
+ROW = np.sqrt(0.75)
+#: Greatest outward share of a hung panel's rulings before the drape; what is too wide then goes into folds.
+STEEPEST = 0.5
+#: Outward share of the folds that a wider panel starts with, and their number around the body.
+_FOLD, _FOLDS = 0.12, 9
+_SAMPLES, _SMOOTHING = 256, 5.0
+
+
+class Belt:
+    """A closed convex curve around a section of a body, by arc length: an angle in [0, 2 pi), from the left forwards.
+
+    Attributes:
+        length: of the curve [m].
+        height: above the ground [m].
+    """
+
+    def __init__(self, points: np.ndarray, ease: float) -> None:
+        """Lay a smooth curve around points.
+
+        Args:
+            points: of the section [m], shape ``(K, 3)``.
+            ease: distance of the curve from their convex hull [m].
+        """
+        hull = points[ConvexHull(points[:, :2]).vertices, :2]
+        angle = np.linspace(0.0, 2.0 * np.pi, _SAMPLES, endpoint=False)
+        normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        tangent = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+        support = (hull @ normal.T).max(axis=0)  # smoothed, it still is one of a convex curve
+        turn = (np.arange(_SAMPLES) + _SAMPLES // 2) % _SAMPLES - _SAMPLES // 2
+        kernel = np.exp(-0.5 * (turn / _SMOOTHING) ** 2)
+        support = np.real(np.fft.ifft(np.fft.fft(support) * np.fft.fft(kernel / kernel.sum())))
+        low = np.maximum((hull @ normal.T).max(axis=0) - support, 0.0).max()
+        support += ease + low
+        slope = (np.roll(support, -1) - np.roll(support, 1)) / (4.0 * np.pi / _SAMPLES)
+        curve = support[:, None] * normal + slope[:, None] * tangent
+        self._curve, self._normal = np.concatenate([curve, curve[:1]]), np.concatenate([normal, normal[:1]])
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._curve, axis=0), axis=1))])
+        self.length, self.height = float(along[-1]), float(points[:, 2].mean())
+        self._angle = along / along[-1] * 2.0 * np.pi
+
+    def at(self, angle: np.ndarray) -> np.ndarray:
+        """Return points of the curve [m], shape ``(N, 3)``."""
+        x, y = (np.interp(angle % (2.0 * np.pi), self._angle, self._curve[:, axis]) for axis in range(2))
+        return np.stack([x, y, np.full(len(angle), self.height)], axis=1)
+
+    def normal(self, angle: np.ndarray) -> np.ndarray:
+        """Return the outward normals there, shape ``(N, 3)``."""
+        x, y = (np.interp(angle % (2.0 * np.pi), self._angle, self._normal[:, axis]) for axis in range(2))
+        normal = np.stack([x, y, np.zeros(len(angle))], axis=1)
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Sector:
+    """A mesh of a flat sector of an annulus, whose ends are sewn together where it is closed.
+
+    Attributes:
+        radius: inner radius r0 [m].
+        flare: angle over a full turn.
+        polar: radius [m] and angle of the vertices, counted on the wearer, a full turn if closed, shape ``(V, 2)``.
+        faces: shape ``(T, 3)`` int32; their outsides are up.
+        rows: vertices of the rings from the inner one outwards.
+    """
+
+    radius: float
+    flare: float
+    polar: np.ndarray
+    faces: np.ndarray
+    rows: tuple[np.ndarray, ...]
+
+    @staticmethod
+    def around(girth: float, length: float, flare: float, edge: float, first: int | None = None) -> Sector:
+        """Return a closed panel.
+
+        Args:
+            girth: length of its inner arc [m].
+            length: from the inner to the outer arc [m].
+            flare: angle over a full turn: 1 is a full circle.
+            edge: length of its edges, about [m].
+            first: number of vertices of the inner ring; by default that of the edges' length.
+        """
+        radius = girth / (2.0 * np.pi * flare)
+        count = max(1, round(length / (edge * ROW)))
+        polar, rows, start = [], [], 0
+        for index, at in enumerate(radius + np.linspace(0.0, length, count + 1)):
+            around = max(8, round(2.0 * np.pi * flare * at / edge)) if index or first is None else first
+            angle = 2.0 * np.pi * (np.arange(around) + 0.5 * (index % 2)) / around
+            polar.append(np.stack([np.full(around, at), angle], axis=1))
+            rows.append(start + np.arange(around))
+            start += around
+        polar = np.concatenate(polar)
+        faces = np.concatenate([ring(a, b, polar[:, 1]) for a, b in zip(rows, rows[1:], strict=False)])
+        return Sector(radius, flare, polar, faces, tuple(rows))
+
+    def lengths(self, pairs: np.ndarray) -> np.ndarray:
+        """Return distances of pairs of vertices ``(K, 2)`` in the flat pattern [m]."""
+        first, second = self.polar[pairs[:, 0]], self.polar[pairs[:, 1]]
+        turn = self.flare * ((first[:, 1] - second[:, 1] + np.pi) % (2.0 * np.pi) - np.pi)
+        square = first[:, 0] ** 2 + second[:, 0] ** 2 - 2.0 * first[:, 0] * second[:, 0] * np.cos(turn)
+        return np.sqrt(np.maximum(square, 0.0))
+
+    def hung(self, belt: Belt, scale: float = 1.0) -> np.ndarray:
+        """Return the vertices hung from a curve [m], shape ``(V, 3)``.
+
+        Args:
+            belt: as long as the inner arc.
+            scale: of the way down, for bodies of another size.
+        """
+        way, angle = scale * (self.polar[:, 0] - self.radius), self.polar[:, 1]
+        outward = min(self.flare, STEEPEST)
+        out, down = way * outward, way * np.sqrt(1.0 - outward**2)
+        if self.flare > STEEPEST:
+            out = out + _FOLD * way * np.cos(_FOLDS * angle + 0.7)
+        return belt.at(angle) + out[:, None] * belt.normal(angle) - down[:, None] * [0.0, 0.0, 1.0]
+
+
+def ring(upper: np.ndarray, lower: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return the triangles between two closed rows of vertices whose angles ascend, shape ``(T, 3)`` int32.
+
+    Args:
+        upper: vertices of the one row.
+        lower: those of the row below it.
+        angle: of all vertices; outsides face away from the axis that it turns about.
+    """
+    faces, i, k = [], 0, 0
+    while i < len(upper) or k < len(lower):
+        above = angle[upper[(i + 1) % len(upper)]] + 2.0 * np.pi * ((i + 1) // len(upper))
+        below = angle[lower[(k + 1) % len(lower)]] + 2.0 * np.pi * ((k + 1) // len(lower))
+        here = upper[i % len(upper)], lower[k % len(lower)]
+        if k == len(lower) or (i < len(upper) and above <= below):
+            faces.append((*here, upper[(i + 1) % len(upper)]))
+            i += 1
+        else:
+            faces.append((*here, lower[(k + 1) % len(lower)]))
+            k += 1
+    return np.array(faces, np.int32)
