@@ -1,10 +1,10 @@
 """Flat patterns: flared panels as sectors of an annulus, which hang from any closed convex curve around a body.
 
-A sector of an annulus is bent without stretch around a convex curve C(s) with outward normal n(s), if its inner arc is
-as long as the curve: ``C(s) + f (r - r0) n - sqrt(1 - f^2) (r - r0) z``, where f is the sector's angle over a full turn
-and r0 the inner radius. Its rulings are straight and all points of one pattern ring are equally low, so that the surface
-is developable (do Carmo, "Differential Geometry of Curves and Surfaces", 1976, sec. 3-5) and rest lengths are those of
-the flat sheet. For f beyond :data:`STEEPEST` the cloth falls into folds, which the drape settles.
+A sector of an annulus with inner radius r0, whose angle over a full turn is f, closes to a cone about a round waist of
+radius f r0: ``c(t) + f (r - r0) n(t) - sqrt(1 - f^2) (r - r0) z``. It is developable (do Carmo, "Differential Geometry of
+Curves and Surfaces", 1976, sec. 3-5), and rest lengths are those of the flat sheet: a hem is 2 pi f (r0 + L) long. About
+another convex curve of that length the rulings are spread evenly, and the drape settles the rest; so it does for f beyond
+:data:`STEEPEST`, where the cloth falls into folds.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Belt:
         support += ease + low
         slope = (np.roll(support, -1) - np.roll(support, 1)) / (4.0 * np.pi / _SAMPLES)
         curve = support[:, None] * normal + slope[:, None] * tangent
-        self._curve, self._normal = np.concatenate([curve, curve[:1]]), np.concatenate([normal, normal[:1]])
+        self._curve = np.concatenate([curve, curve[:1]])
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._curve, axis=0), axis=1))])
         self.length, self.height = float(along[-1]), float(points[:, 2].mean())
         self._angle = along / along[-1] * 2.0 * np.pi
@@ -59,12 +59,6 @@ class Belt:
         """Return points of the curve [m], shape ``(N, 3)``."""
         x, y = (np.interp(angle % (2.0 * np.pi), self._angle, self._curve[:, axis]) for axis in range(2))
         return np.stack([x, y, np.full(len(angle), self.height)], axis=1)
-
-    def normal(self, angle: np.ndarray) -> np.ndarray:
-        """Return the outward normals there, shape ``(N, 3)``."""
-        x, y = (np.interp(angle % (2.0 * np.pi), self._angle, self._normal[:, axis]) for axis in range(2))
-        normal = np.stack([x, y, np.zeros(len(angle))], axis=1)
-        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +80,7 @@ class Sector:
     rows: tuple[np.ndarray, ...]
 
     @staticmethod
-    def around(girth: float, length: float, flare: float, edge: float, first: int | None = None) -> Sector:
+    def around(girth: float, length: float, flare: float, edge: float, first: np.ndarray | None = None) -> Sector:
         """Return a closed panel.
 
         Args:
@@ -94,17 +88,19 @@ class Sector:
             length: from the inner to the outer arc [m].
             flare: angle over a full turn: 1 is a full circle.
             edge: length of its edges, about [m].
-            first: number of vertices of the inner ring; by default that of the edges' length.
+            first: ascending angles of the inner ring; by default as many as the edges' length wants.
         """
         radius = girth / (2.0 * np.pi * flare)
         count = max(1, round(length / (edge * ROW)))
         polar, rows, start = [], [], 0
         for index, at in enumerate(radius + np.linspace(0.0, length, count + 1)):
-            around = max(8, round(2.0 * np.pi * flare * at / edge)) if index or first is None else first
+            around = max(8, round(2.0 * np.pi * flare * at / edge))
             angle = 2.0 * np.pi * (np.arange(around) + 0.5 * (index % 2)) / around
-            polar.append(np.stack([np.full(around, at), angle], axis=1))
-            rows.append(start + np.arange(around))
-            start += around
+            if index == 0 and first is not None:
+                angle = first
+            polar.append(np.stack([np.full(len(angle), at), angle], axis=1))
+            rows.append(start + np.arange(len(angle)))
+            start += len(angle)
         polar = np.concatenate(polar)
         faces = np.concatenate([ring(a, b, polar[:, 1]) for a, b in zip(rows, rows[1:], strict=False)])
         return Sector(radius, flare, polar, faces, tuple(rows))
@@ -128,7 +124,8 @@ class Sector:
         out, down = way * outward, way * np.sqrt(1.0 - outward**2)
         if self.flare > STEEPEST:
             out = out + _FOLD * way * np.cos(_FOLDS * angle + 0.7)
-        return belt.at(angle) + out[:, None] * belt.normal(angle) - down[:, None] * [0.0, 0.0, 1.0]
+        ruling = np.stack([out * np.cos(angle), out * np.sin(angle), -down], axis=1)
+        return belt.at(angle) + ruling
 
 
 def ring(upper: np.ndarray, lower: np.ndarray, angle: np.ndarray) -> np.ndarray:

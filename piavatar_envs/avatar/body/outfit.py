@@ -87,7 +87,7 @@ def dressed(asset: AvatarAsset) -> Look:
     fields = np.stack([garment(points, at, share) for garment in garments], axis=1)
     blend, faces = sparse.eye_array(len(points), format="csr"), asset.faces.astype(np.int64)
     for garment, level in ((0, -_SEAM), (0, _SEAM), (0, _TRIM - _SEAM), (0, _TRIM + _SEAM), *_both(1), *_both(2)):
-        rows, faces = _cut(fields[:, garment] - level, faces)
+        rows, faces = cut_triangles(fields[:, garment] - level, faces)
         blend, fields = (rows @ blend).tocsr(), rows @ fields
     faces = faces[(fields[faces, 3] < _SOLE).any(axis=1)]  # the foot in a shoe is not seen
     used, faces = np.unique(faces, return_inverse=True)
@@ -221,7 +221,7 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
-def _cut(field: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:
+def cut_triangles(field: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:
     """Cut triangles where a field crosses zero.
 
     Args:
@@ -286,7 +286,7 @@ def _shoe(
     ring[:, :, 1] += _LEATHER * np.linspace(-1.0, 1.0, _SECTIONS)[:, None]
     vertices = np.concatenate([ring.reshape(-1, 3), ring[[0, -1]].mean(axis=1)])
     faces = _tube(_SECTIONS, _AROUND)
-    blend, faces = _cut(vertices[:, 2] - floor - _SOLE, faces)
+    blend, faces = cut_triangles(vertices[:, 2] - floor - _SOLE, faces)
     vertices = blend @ vertices
     material = np.where(vertices[:, 2] > floor + _SOLE + 1e-6, _Part.SHOES, _Part.SOLES)
     vertices[:, 2] = np.maximum(vertices[:, 2], floor)

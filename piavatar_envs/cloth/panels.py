@@ -1,0 +1,230 @@
+"""Panels cut from the skin itself: the body's surface inside of seams, moved outwards, smoothed and meshed anew.
+
+A garment close to the body, such as a shirt, follows its skin. It is cut where a field over the skin crosses zero, whose
+parts are planes through joints, so that bodies of any size can be dressed; it is eased outwards along the normals, and
+smoothed without loss of size (G. Taubin, "A signal processing approach to fair surface design", 1995), borders along
+themselves. What the smoothing took inwards comes out of the skin again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from piavatar_envs.avatar.body.outfit import cut_triangles
+from piavatar_envs.avatar.body.registration import vertex_normals
+from piavatar_envs.cloth.pattern import ROW
+from piavatar_envs.cloth.remesh import boundary_loops, remesh
+from piavatar_envs.cloth.wearer import Wearer
+
+#: Ways outwards [m], shape ``(W, 3)``, of a piece's points with normals, and its shares of the wearer's vertices.
+Ease = Callable[[Wearer, sparse.csr_array, np.ndarray, np.ndarray], np.ndarray]
+#: Shares of a smoothing pass and of the one back, which keeps the size.
+_SHARES = 0.63, -0.65
+#: Passes along the coarse mesh, which make its edges even.
+_EVENING = 12
+#: Turns of edges in which a mesh is made of better triangles, over the number of its edges.
+_MOST_FLIPS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A piece of the skin on which a garment is laid out.
+
+    Attributes:
+        blend: shares of the skin's vertices in those of the piece, rows sum to one, shape ``(W, V)``.
+        rows: triangles of the piece, shape ``(U, 3)``.
+        rim: whether a vertex is on a border of the piece, shape ``(W,)`` bool.
+        keep: vertices of the piece that are those of the garment, shape ``(N,)``.
+        faces: triangles of the garment, shape ``(T, 3)`` int32.
+    """
+
+    blend: sparse.csr_array
+    rows: np.ndarray
+    rim: np.ndarray
+    keep: np.ndarray
+    faces: np.ndarray
+
+    @property
+    def anchors(self) -> sparse.csr_array:
+        """Shares of the skin's vertices in those of the garment, shape ``(N, V)``."""
+        return self.blend[self.keep]
+
+
+def lay_out(wearer: Wearer, field: np.ndarray, ease: Ease, gap: float, edge: float, smoothing: int) -> Panel:
+    """Return the largest piece of skin inside of a field, meshed for cloth.
+
+    Args:
+        wearer: the body.
+        field: of its vertices, positive inside, zero on the seams, shape ``(V,)``.
+        ease: way outwards of the cloth.
+        gap: least distance from the skin [m].
+        edge: length of the garment's edges, about [m].
+        smoothing: passes of it.
+
+    Raises:
+        ValueError: less than a few edges' size is inside.
+    """
+    blend, triangles = cut_triangles(field, wearer.faces.astype(np.int64))
+    inside = blend @ field > -1.0e-9
+    triangles = triangles[inside[triangles].all(axis=1)]
+    triangles = _largest(triangles, blend.shape[0])
+    used, rows = np.unique(triangles, return_inverse=True)
+    if len(used) < 20:
+        raise ValueError("nothing of the body is inside of the garment's seams; lengthen it")
+    blend, rows = blend[used].tocsr(), rows.reshape(-1, 3)
+    rim = np.zeros(len(used), bool)
+    for loop in boundary_loops(rows):
+        rim[loop] = True
+    points = _laid(wearer, blend, rows, rim, ease, gap, smoothing)
+    area = 0.5 * np.linalg.norm(np.cross(*_sides(points, rows)), axis=1).sum()
+    count = max(int(area / (ROW * edge**2)), 12)
+    found = remesh(points, rows, min(count, len(used)), first=boundary_loops(rows), spacing=edge)
+    panel = Panel(blend, rows, rim, found.keep, found.faces)
+    return replace(panel, faces=flipped(laid(wearer, panel, ease, gap, smoothing), panel.faces))
+
+
+def laid(wearer: Wearer, panel: Panel, ease: Ease, gap: float, smoothing: int) -> np.ndarray:
+    """Return the vertices of a garment on a wearer [m], shape ``(N, 3)``; arguments as of :func:`lay_out`."""
+    points = _laid(wearer, panel.blend, panel.rows, panel.rim, ease, gap, smoothing)[panel.keep]
+    border = np.zeros(len(points), bool)
+    for loop in boundary_loops(panel.faces):
+        border[loop] = True
+    mean = _means(panel.faces, border)
+    inner = border & ~panel.rim[panel.keep]  # of the piece, but on the border of the garment: a notch
+    points[inner] = (mean @ points)[inner]
+    for _ in range(_EVENING):
+        way, normals = mean @ points - points, vertex_normals(points, panel.faces)
+        points = points + 0.5 * (way - np.einsum("nd,nd->n", way, normals)[:, None] * normals)
+    return wearer.outside(points, gap)
+
+
+def along_limb(wearer: Wearer, first: str, second: str, third: str) -> np.ndarray:
+    """Return how far each vertex is along the limbs of both sides, shape ``(V,)``; minus infinity elsewhere.
+
+    It is 0 at the first joint, 1 at the second and 2 at the third, and goes on beyond them.
+    """
+    along = np.full(len(wearer.vertices), -np.inf)
+    for side in ("left", "right"):
+        joints = [wearer.at(f"{side}_{joint}") for joint in (first, second, third)]
+        for index, joint in enumerate((first, second)):
+            way = joints[index + 1] - joints[index]
+            own = wearer.turned_by(f"{side}_{joint}") > 0.5
+            along = np.where(own, index + (wearer.vertices - joints[index]) @ way / (way @ way), along)
+    return along
+
+
+def limb_field(wearer: Wearer, along: np.ndarray, end: float, first: str, second: str) -> np.ndarray:
+    """Return the distance of each vertex from a limb's seam [m], positive before it; 1 m elsewhere; shape ``(V,)``.
+
+    Args:
+        wearer: the body.
+        along: of :func:`along_limb`.
+        end: place of the seam along it.
+        first: joint at its beginning, without the side.
+        second: the next one.
+    """
+    size = np.linalg.norm(wearer.at(f"left_{second}") - wearer.at(f"left_{first}"))
+    return np.where(np.isfinite(along), (end - along) * size, 1.0)
+
+
+def below_neck(wearer: Wearer, depth: float, tilt: float) -> np.ndarray:
+    """Return the distance of each vertex below a neckline [m], shape ``(V,)``.
+
+    Args:
+        wearer: the body.
+        depth: of the neckline below the joint of the neck, over the way from there to the joint of the chest.
+        tilt: slope of its plane, lower in front.
+    """
+    neck = wearer.at("neck")
+    down = np.array([0.0, tilt, -1.0]) / np.hypot(tilt, 1.0)
+    start = neck - [0.0, 0.0, depth * (neck[2] - wearer.at("spine3")[2])]
+    field = (wearer.vertices - start) @ down
+    return np.where(wearer.turned_by("head") > 0.5, -1.0, field)
+
+
+def _laid(
+    wearer: Wearer, blend: sparse.csr_array, rows: np.ndarray, rim: np.ndarray, ease: Ease, gap: float, smoothing: int
+) -> np.ndarray:
+    """Return the vertices of a piece of skin, eased outwards and smoothed [m], shape ``(W, 3)``."""
+    points = blend @ wearer.vertices
+    normals = vertex_normals(points, rows)
+    points = points + ease(wearer, blend, points, normals)
+    mean = _means(rows, rim)
+    for step in range(smoothing):
+        for share in _SHARES:
+            points = points + share * (mean @ points - points)
+        if step % 8 == 7:
+            points = wearer.outside(points, gap)
+    return wearer.outside(points, gap)
+
+
+def _means(faces: np.ndarray, rim: np.ndarray) -> sparse.csr_array:
+    """Return the matrix that takes the mean of each vertex's neighbors; on a border, of those along it."""
+    links = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    near = sparse.coo_array((np.ones(len(links)), links.T), shape=(len(rim), len(rim))).tocsr()
+    near = ((near + near.T) > 0).astype(np.float64)
+    border = sparse.csr_array((len(rim), len(rim)))
+    loops = boundary_loops(faces)
+    if loops:
+        start, end = np.concatenate(loops), np.concatenate([np.roll(loop, -1) for loop in loops])
+        border = sparse.coo_array((np.ones(len(start)), (start, end)), shape=near.shape).tocsr()
+        border = ((border + border.T) > 0).astype(np.float64)
+    inner = sparse.diags_array((~rim).astype(np.float64)) @ near
+    both = (inner + sparse.diags_array(rim.astype(np.float64)) @ border).tocsr()
+    return sparse.diags_array(1.0 / np.maximum(both.sum(axis=1), 1.0)) @ both
+
+
+def flipped(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return triangles with edges turned where the angles opposite to them are more than pi together.
+
+    Such edges are those that are not of the intrinsic Delaunay triangulation (Bobenko & Springborn, "A discrete
+    Laplace-Beltrami operator for simplicial surfaces", 2007), which has the largest least angles.
+    """
+    triangles = [tuple(face) for face in faces.tolist()]
+    beside = {(t[k], t[(k + 1) % 3]): index for index, t in enumerate(triangles) for k in range(3)}
+    queue = [edge for edge in beside if edge[0] < edge[1]]
+    for _ in range(_MOST_FLIPS * len(queue)):
+        if not queue:
+            break
+        a, b = queue.pop()
+        one, two = beside.get((a, b)), beside.get((b, a))
+        if one is None or two is None:
+            continue
+        c, d = (next(v for v in triangles[index] if v not in (a, b)) for index in (one, two))
+        taken = (c, d) in beside or (d, c) in beside
+        if taken or _angle(points, c, a, b) + _angle(points, d, a, b) <= np.pi + 1.0e-6:
+            continue
+        del beside[a, b], beside[b, a]
+        triangles[one], triangles[two] = (c, a, d), (d, b, c)
+        for index in (one, two):
+            t = triangles[index]
+            beside |= {(t[k], t[(k + 1) % 3]): index for k in range(3)}
+        queue += [(c, a), (a, d), (d, b), (b, c)]
+    return np.array(triangles, faces.dtype)
+
+
+def _angle(points: np.ndarray, at: int, first: int, second: int) -> float:
+    """Return the angle at a vertex between two others."""
+    a, b = points[first] - points[at], points[second] - points[at]
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def _largest(triangles: np.ndarray, count: int) -> np.ndarray:
+    """Return the triangles of the piece with most of them."""
+    if not len(triangles):
+        return triangles
+    links = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+    graph = sparse.coo_array((np.ones(len(links)), links.T), shape=(count, count))
+    piece = connected_components(graph, directed=False)[1][triangles[:, 0]]
+    return triangles[piece == np.bincount(piece).argmax()]
+
+
+def _sides(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two sides of each triangle [m], each shape ``(T, 3)``."""
+    corner = points[faces[:, 0]]
+    return points[faces[:, 1]] - corner, points[faces[:, 2]] - corner
