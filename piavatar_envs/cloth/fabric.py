@@ -1,4 +1,4 @@
-"""Fabrics: what cloth weighs, how it stretches, bends and rubs, from published measurements.
+"""Fabrics: weight, stretch, bending and friction of cloth, from published measurements.
 
 A fabric is isotropic and linear here, at the small strains of cloth that is worn. Sources of the table:
 
@@ -35,7 +35,7 @@ MOST_STRETCH = 500.0
 
 @dataclass(frozen=True)
 class Fabric:
-    """What a garment is made of.
+    """Weight, stiffness, friction and colours of cloth.
 
     Attributes:
         areal_density: mass per area [kg/m^2].

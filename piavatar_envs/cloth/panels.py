@@ -1,9 +1,9 @@
 """Panels cut from the skin itself: the body's surface inside of seams, moved outwards, smoothed and meshed anew.
 
-A garment close to the body, such as a shirt, follows its skin. It is cut where a field over the skin crosses zero, whose
-parts are planes through joints, so that bodies of any size can be dressed; it is eased outwards along the normals, and
-smoothed without loss of size (G. Taubin, "A signal processing approach to fair surface design", 1995), borders along
-themselves. What the smoothing took inwards comes out of the skin again.
+A garment close to the body, such as a shirt, follows its skin. It is cut where a field over the skin crosses zero,
+parts of which are planes placed by joints, so that bodies of any size can be dressed. It is eased outwards along the
+normals, and smoothed without loss of size (G. Taubin, "A signal processing approach to fair surface design", 1995),
+borders along themselves. What the smoothing took inwards comes out of the skin again.
 """
 
 from __future__ import annotations

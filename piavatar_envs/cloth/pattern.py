@@ -1,15 +1,16 @@
 """Flat patterns: flared panels as sectors of an annulus, which hang from any closed convex curve around a body.
 
 A sector of an annulus with inner radius r0, whose angle over a full turn is f, closes to a cone about a round waist of
-radius f r0: ``c(t) + f (r - r0) n(t) - sqrt(1 - f^2) (r - r0) z``. It is developable (do Carmo, "Differential Geometry of
-Curves and Surfaces", 1976, sec. 3-5), and rest lengths are those of the flat sheet: a hem is 2 pi f (r0 + L) long. About
-another convex curve of that length the rulings are spread evenly, and the drape settles the rest; so it does for f beyond
-:data:`STEEPEST`, where the cloth falls into folds.
+radius f r0: ``c(t) + f (r - r0) n(t) - sqrt(1 - f^2) (r - r0) z``. It is developable (do Carmo, "Differential Geometry
+of Curves and Surfaces", 1976, sec. 3-5), and rest lengths are those of the flat sheet: a hem is 2 pi f (r0 + L) long.
+About another convex curve of that length the rulings are spread evenly, and the drape settles the rest; so it does for
+f beyond :data:`STEEPEST`, where the cloth falls into folds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -102,7 +103,7 @@ class Sector:
             rows.append(start + np.arange(len(angle)))
             start += len(angle)
         polar = np.concatenate(polar)
-        faces = np.concatenate([ring(a, b, polar[:, 1]) for a, b in zip(rows, rows[1:], strict=False)])
+        faces = np.concatenate([ring(a, b, polar[:, 1]) for a, b in pairwise(rows)])
         return Sector(radius, flare, polar, faces, tuple(rows))
 
     def lengths(self, pairs: np.ndarray) -> np.ndarray:

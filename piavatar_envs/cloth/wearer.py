@@ -9,12 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, turned_shares
+from piavatar_envs.avatar.body.registration import vertex_normals
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.avatar.body.registration import vertex_normals
 
-#: Parts of a body, as bits.
-TRUNK, HEAD, LEFT_ARM, RIGHT_ARM, LEFT_LEG, RIGHT_LEG = 1, 2, 4, 8, 16, 32
 #: Steps and the largest step [m] in which points are brought out of the skin.
 _STEPS, _LONGEST = 12, 0.03
 

@@ -6,6 +6,7 @@ for users: they appear on the pages of the environments, with the unit in bracke
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
@@ -15,6 +16,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from piavatar_envs.avatar.body.flesh_stiffness import FREE_SHARE
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.body.sources import check_settings, check_source
+from piavatar_envs.cloth.fabric import Fabric, check_fabric, fabric_of
+from piavatar_envs.cloth.garments import check_kind
+from piavatar_envs.cloth.garments import check_settings as check_garment
 from piavatar_envs.config.load import ConfigError, load_config
 from piavatar_envs.mpm.materials import check_material
 from piavatar_envs.mpm.model import CFL_STABLE
@@ -97,6 +101,8 @@ MOST_VISCOSITY, MOST_DAMPING = 1.0e6, 10.0
 LEAST_DENSITY, MOST_DENSITY = 0.1, 25_000.0
 #: Greatest distance from the origin along each axis [m].
 FARTHEST = 1000.0
+#: Colour of the inside of a garment over that of its outside.
+_INSIDE = 0.75
 #: The range of a factor that changes nothing.
 UNCHANGED = (1.0, 1.0)
 
@@ -116,6 +122,7 @@ Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
 TopSpeed = Annotated[float, Field(ge=0.0, le=1.0e6)]
 Spin = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 ShapeValue = Annotated[float, Field(ge=-1.0, le=1.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Factor = Annotated[float, Field(ge=1.0e-3, le=1.0e3)]
 FactorRange = Annotated[tuple[Factor, Factor], AfterValidator(_check_order)]
 Rate = Annotated[float, Field(le=1.0e6)]
@@ -322,6 +329,66 @@ class AvatarSourceConfig(BaseModel):
         return load_config(AvatarSourceConfig, None if "source" in own else self, own)
 
 
+class GarmentConfig(BaseModel):
+    """A loose garment and its kind's own settings; see :mod:`piavatar_envs.cloth.garments` and docs/garments.md."""
+
+    model_config = FROZEN | {"extra": "allow"}
+    __pydantic_extra__: dict[str, PlainValue]
+
+    kind: Annotated[str, AfterValidator(check_kind)] = Field(
+        ...,
+        description="skirt, dress, shirt, trousers, scarf, cape, a mesh of your own, or another kind of "
+        "docs/garments.md, by its name; further settings are those of the kind",
+    )
+    fabric: Annotated[str, AfterValidator(check_fabric)] = Field(
+        "cotton", description="cotton, denim, silk, another fabric of docs/garments.md, or one of your own, by its name"
+    )
+    color: tuple[Share, Share, Share] | None = Field(None, description="sRGB, each in [0, 1]; null as the fabric [-]")
+    areal_density: float | None = Field(None, ge=0.01, le=5.0, description="mass per area; null as the fabric [kg/m^2]")
+    stretch: float | None = Field(
+        None, ge=1.0, le=1.0e5, description="membrane stiffness E h; null as the fabric [N/m]"
+    )
+    bending: float | None = Field(None, ge=0.0, le=1.0, description="bending stiffness; null as the fabric [N m]")
+    friction: float | None = Field(
+        None, ge=0.0, le=10.0, description="Coulomb coefficient on skin; null as the fabric [-]"
+    )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The kind's own settings."""
+        return {name: value for name, value in (self.__pydantic_extra__ or {}).items() if value is not None}
+
+    @property
+    def cloth(self) -> Fabric:
+        """The fabric with this garment's own values."""
+        names = ("areal_density", "stretch", "bending", "friction")
+        own = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        if self.color is not None:
+            own |= {"front": self.color, "back": tuple(_INSIDE * part for part in self.color)}
+        return dataclasses.replace(fabric_of(self.fabric), **own)
+
+    @model_validator(mode="after")
+    def _check_settings(self) -> GarmentConfig:
+        """Refuse settings that the kind does not have."""
+        try:
+            check_garment(self.kind, self.settings)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        return self
+
+
+class ClothConfig(BaseModel):
+    """The solver of garments; without effect where there are none."""
+
+    model_config = FROZEN
+
+    solver: Literal["xpbd"] = Field("xpbd", description="xpbd: extended position-based dynamics with small steps")
+    substeps: int = Field(20, ge=1, le=1000, description="substeps of cloth in a control step, of which 20 suit 1/30 s")
+    sweeps: int = Field(4, ge=1, le=100, description="sweeps over the edges in a substep; with fewer, cloth may buzz")
+    self_collision: bool = Field(False, description="keep garments apart from themselves and each other")
+    wind: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="velocity of the air [m/s]")
+
+
 class ShapeConfig(BaseModel):
     """The body's shape: fixed parameters, or a random shape at each reset."""
 
@@ -360,6 +427,13 @@ class RandomizeConfig(BaseModel):
     )
     body_friction_factor: FactorRange = Field(
         UNCHANGED, description="range of the factor on all friction between avatars and props [-]"
+    )
+    cloth_mass_factor: FactorRange = Field(UNCHANGED, description="range of the factor on the mass of garments [-]")
+    cloth_stiffness_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on stretch and bending stiffness of garments [-]"
+    )
+    cloth_friction_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on all friction of garments [-]"
     )
 
 
@@ -519,6 +593,9 @@ class AvatarConfig(BaseModel):
         default_factory=dict, description="settings of its shape"
     )
     regions: tuple[RegionConfig, ...] = Field((), description="flesh of other materials; later ones win")
+    garments: tuple[GarmentConfig, ...] | None = Field(
+        None, description="its garments, from the innermost; null for those of the environment"
+    )
 
 
 class PropConfig(BaseModel):
@@ -755,6 +832,8 @@ class EnvConfig(BaseModel):
     control: ControlConfig = Field(default_factory=PoseControlConfig, description="how actions move the body")
     avatar: AvatarSourceConfig = Field(default_factory=AvatarSourceConfig, description="the source of the body")
     shape: ShapeConfig = Field(default_factory=ShapeConfig, description="the body's shape")
+    garments: tuple[GarmentConfig, ...] = Field((), description="what every avatar wears, from the innermost")
+    cloth: ClothConfig = Field(default_factory=ClothConfig, description="the solver of garments")
     randomize: RandomizeConfig = Field(default_factory=RandomizeConfig, description="factors that every episode draws")
     scene: SceneConfig = Field(default_factory=SceneConfig, description="avatars, props, colliders and their contact")
     render: RenderConfig = Field(default_factory=RenderConfig, description="pictures")

@@ -90,7 +90,9 @@ def check_settings(kind: str, settings: Mapping[str, Any]) -> None:
             TypeAdapter(hints[name]).validate_python(settings[name], strict=True)
         except ValidationError as error:
             wanted = error.errors()[0]["msg"].replace("Input should be", "must be")
-            raise ValueError(f"{name}={settings[name]!r} of the garment {kind!r} {wanted}{_unit(hints[name])}") from None
+            raise ValueError(
+                f"{name}={settings[name]!r} of the garment {kind!r} {wanted}{_unit(hints[name])}"
+            ) from None
 
 
 def cut_garment(kind: str, wearer: Wearer, settings: Mapping[str, Any]) -> Cut:

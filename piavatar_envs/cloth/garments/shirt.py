@@ -10,7 +10,8 @@ from scipy import sparse
 
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.panels import along_limb, below_neck, laid, lay_out, limb_field
-from piavatar_envs.cloth.wearer import LEFT_ARM, RIGHT_ARM, TRUNK, Wearer
+from piavatar_envs.cloth.proxy import LEFT_ARM, RIGHT_ARM, TRUNK
+from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance at which a shirt lies on the skin, and its ease at the chest [m].
 THICKNESS, _EASE = 0.006, 0.010

@@ -9,7 +9,8 @@ from pydantic import Field
 
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.pattern import Belt, Sector
-from piavatar_envs.cloth.wearer import LEFT_LEG, RIGHT_LEG, TRUNK, Wearer
+from piavatar_envs.cloth.proxy import LEFT_LEG, RIGHT_LEG, TRUNK
+from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance of a waistband from the hull of the body [m].
 EASE = 0.006

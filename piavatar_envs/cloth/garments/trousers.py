@@ -10,8 +10,9 @@ from scipy import sparse
 
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.panels import along_limb, laid, lay_out, limb_field
+from piavatar_envs.cloth.proxy import LEFT_LEG, RIGHT_LEG, TRUNK
 from piavatar_envs.cloth.remesh import boundary_loops
-from piavatar_envs.cloth.wearer import LEFT_LEG, RIGHT_LEG, TRUNK, Wearer
+from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance at which trousers lie on the skin, and their ease at waist and hips [m].
 THICKNESS, _EASE = 0.006, 0.008
@@ -64,7 +65,9 @@ def cut(
             way += share[:, None] * np.maximum(wide / size - 1.0, 0.0) * outward
             inside = blend @ own.astype(np.float64) > 0.5
             limit = np.minimum(sign * points[:, 0], _APART)
-            way[:, 0] = np.where(inside, sign * np.maximum(sign * (points + way)[:, 0], limit) - points[:, 0], way[:, 0])
+            way[:, 0] = np.where(
+                inside, sign * np.maximum(sign * (points + way)[:, 0], limit) - points[:, 0], way[:, 0]
+            )
         return way
 
     panel = lay_out(wearer, field, ease, THICKNESS, edge, _SMOOTHING)
