@@ -1,0 +1,1 @@
+"""Garments against theory, and on bodies: ``python -m benchmarks.garments``."""
