@@ -93,6 +93,7 @@ format: install
 docs: install $(if $(CHECK),,$(VENV)/.docs)
 	$(BIN)/python -m scripts.env_pages $(if $(CHECK),--check) $(if $(PICTURES),--pictures)
 ifndef CHECK
+	$(BIN)/python -m benchmarks.report --out docs/report
 	$(BIN)/python -m sphinx -b html --fail-on-warning --keep-going --quiet docs build/site
 	@echo "built build/site/index.html"
 endif
