@@ -35,8 +35,10 @@ from piavatar_envs.core.structs import fill
 from piavatar_envs.mpm.types import row
 
 if TYPE_CHECKING:
+    from piavatar_envs.avatar.avatar import Avatar
     from piavatar_envs.avatar.body.asset import AvatarAsset, PoseDisplacements
     from piavatar_envs.avatar.body.pose_correctives import PoseCorrectives
+    from piavatar_envs.avatar.types import Pose
 
 wp.set_module_options({"enable_backward": False})
 
@@ -223,8 +225,23 @@ def record_skin(
     """
     inputs, pictures = [envs, surface, motion, workspace], len(envs)
     graph.launch(pose_skin, (pictures, NUM_JOINTS), inputs)
-    graph.launch(displace_particles, (pictures, len(surface.used)), inputs)
+    if len(surface.used):
+        graph.launch(displace_particles, (pictures, len(surface.used)), inputs)
     graph.launch(deform_skin, (pictures, len(surface.rest)), [*inputs, first], [vertices])
+
+
+def motion_of(avatar: Avatar, x: wp.array, pose: Pose | None = None, shape: wp.array | None = None) -> SkinMotion:
+    """Return what moves the skin of an avatar, in live arrays.
+
+    Args:
+        avatar: the avatar.
+        x: positions of all particles ``(num_envs, particles)`` [m].
+        pose: of its bones; as they are tracked if not given.
+        shape: parameters ``(num_envs, S)``, where shapes are random.
+    """
+    none = wp.zeros((1, 1), dtype=float, device=avatar.model.device)
+    sources = avatar.body, pose or avatar.tracked
+    return fill(SkinMotion(), *sources, x=x, shape=none if shape is None else shape)
 
 
 def skin_workspace(surface: SkinSurface, pictures: int, device: str) -> SkinWorkspace:
@@ -331,6 +348,11 @@ class Skin:
         return self._interpolation.shape[0]
 
     @property
+    def weights(self) -> sparse.csr_array:
+        """Weights of the particles in the displacements of vertices, rows sum to one, shape ``(V, P)``."""
+        return self._interpolation
+
+    @property
     def num_particles(self) -> int:
         """Particles of the body."""
         return self._interpolation.shape[1]
@@ -363,39 +385,29 @@ class Skin:
             directions = padded.reshape(-1, TILE, *elements.shape[1:]).transpose(0, 3, 1, 2)
             directions, reference = directions.reshape(len(directions), -1, 3), self._pose.reference
 
-        def array(values: np.ndarray, dtype: type) -> wp.array:
-            scalar = np.int32 if dtype is int else np.float32
-            return wp.array(np.ascontiguousarray(values, scalar), dtype=dtype, device=device)
-
-        return fill(
-            SkinSurface(),
-            rest=array(rest, wp.vec3),
-            skin=array(self._vertex_skin, wp.vec4),
-            near=array(near.reshape(neighbours.shape).T, int),
-            weight=array(self._interpolation.data.reshape(neighbours.shape).T, float),
-            used=array(used, int),
-            deltas=array(deltas, wp.vec3),
-            pelvis=array(pelvis, wp.vec3),
-            directions=array(directions, wp.vec3),
-            reference=array(reference, wp.mat33),
-            parent=array(np.array(PARENTS), int),
-            **{name: array(values, dtype) for name, values, dtype in self._correctives_of(used)},
+        return _upload(
+            device,
+            rest=rest,
+            skin=self._vertex_skin,
+            near=near.reshape(neighbours.shape).T,
+            weight=self._interpolation.data.reshape(neighbours.shape).T,
+            used=used,
+            deltas=deltas,
+            pelvis=pelvis,
+            directions=directions,
+            reference=reference,
+            **self._correctives_of(used),
         )
 
-    def _correctives_of(self, used: np.ndarray) -> tuple[tuple[str, np.ndarray, type], ...]:
-        """Return the correctives of some particles: name, values and type of each array."""
-        none = np.zeros((0, 3, 3))
-        start, joint, linear, quadratic = np.zeros(1), np.zeros(0), none, none
-        if self._correctives is not None:
-            own = self._correctives
-            counts = np.diff(own.start)[used]
-            start = np.concatenate([[0], np.cumsum(counts)])
-            entries = np.repeat(own.start[used] - start[:-1], counts) + np.arange(start[-1])
-            joint, linear, quadratic = (getattr(own, name)[entries] for name in ("joint", "linear", "quadratic"))
-        return (
-            ("start", start, int), ("joint", joint, int), ("linear", linear, wp.mat33),
-            ("quadratic", quadratic, wp.mat33),
-        )  # fmt: skip
+    def _correctives_of(self, used: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the correctives of some particles, by the names of the surface."""
+        if self._correctives is None:
+            return {}
+        own = self._correctives
+        counts = np.diff(own.start)[used]
+        start = np.concatenate([[0], np.cumsum(counts)])
+        entries = np.repeat(own.start[used] - start[:-1], counts) + np.arange(start[-1])
+        return {"start": start} | {name: getattr(own, name)[entries] for name in ("joint", "linear", "quadratic")}
 
     def deform(self, rotations: np.ndarray, positions: np.ndarray, particle_positions: np.ndarray) -> np.ndarray:
         """Compute the skin vertices of one state, on the CPU.
@@ -442,6 +454,58 @@ class Skin:
     def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
         """Interpolate a quantity of the particles on the skin, shape ``(P, ...)`` to ``(V, ...)``."""
         return self._interpolation @ np.asarray(per_particle, dtype=np.float64)
+
+
+def bone_surface(
+    rest: np.ndarray,
+    skin_joints: np.ndarray,
+    skin_weights: np.ndarray,
+    device: str,
+    deltas: np.ndarray | None = None,
+    pelvis: np.ndarray | None = None,
+) -> SkinSurface:
+    """Return a surface on a device that only bones move, for :func:`record_skin`.
+
+    Args:
+        rest: vertices in the rest pose, or where the mean shape is if there are ``deltas`` [m], shape ``(V, 3)``.
+        skin_joints: joints that move each vertex, shape ``(V, 4)``.
+        skin_weights: their weights, shape ``(V, 4)``.
+        device: Warp device.
+        deltas: displacements at -1 and at +1 of each shape parameter [m], shape ``(2 S, V, 3)``.
+        pelvis: that of the mean shape, and its displacements likewise [m], shape ``(1 + 2 S, 3)``.
+    """
+    none = np.zeros((0, len(rest)))
+    return _upload(
+        device,
+        rest=rest,
+        skin=pack(*in_order(np.asarray(skin_joints), np.asarray(skin_weights))),
+        near=none,
+        weight=none,
+        used=np.zeros(0),
+        deltas=np.zeros((0, len(rest), 3)) if deltas is None else deltas,
+        pelvis=np.zeros((1, 3)) if pelvis is None else pelvis,
+        directions=np.zeros((0, TILE, 3)),
+        reference=np.tile(np.eye(3), (NUM_JOINTS, 1, 1)),
+    )
+
+
+#: Arrays of a surface without correctives.
+_NO_CORRECTIVES = {
+    "start": np.zeros(1),
+    "joint": np.zeros(0),
+    "linear": np.zeros((0, 3, 3)),
+    "quadratic": np.zeros((0, 3, 3)),
+}
+
+
+def _upload(device: str, **values: np.ndarray) -> SkinSurface:
+    """Return a surface on a device from its arrays by name."""
+    surface = SkinSurface()
+    for name, value in ({"parent": np.array(PARENTS)} | _NO_CORRECTIVES | values).items():
+        dtype = SkinSurface.vars[name].type.dtype
+        scalar = np.int32 if dtype is wp.int32 else np.float32
+        setattr(surface, name, wp.array(np.ascontiguousarray(value, scalar), dtype=dtype, device=device))
+    return surface
 
 
 def _interpolation(vertices: np.ndarray, particles: np.ndarray, own: Skinning, others: Skinning) -> sparse.csr_array:

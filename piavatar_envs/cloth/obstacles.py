@@ -26,7 +26,7 @@ import numpy as np
 import warp as wp
 from scipy import sparse
 
-from piavatar_envs.core.arrays import matrix_at, store_matrix
+from piavatar_envs.core.arrays import matrix_at, store_matrix, vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.mpm.types import Model, State, row
@@ -242,7 +242,7 @@ def sum_couples(
 ):
     """Read and clear the impulses on the points, and move their moments to the particles' mean; ``(num_envs, N)``."""
     e, i = wp.tid()
-    sums = wp.types.vector(length=6, dtype=float)()
+    sums = vec6()
     for n in range(6):
         sums[n] = float(_QUANTUM * wp.float64(obstacles.impulse[e, i, n]))
         obstacles.impulse[e, i, n] = wp.int64(0)

@@ -22,7 +22,15 @@ import warp as wp
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.splats import SplatCloud, joined_colors
-from piavatar_envs.avatar.skin import Skin, SkinMotion, SkinSurface, SkinWorkspace, record_skin, skin_workspace
+from piavatar_envs.avatar.skin import (
+    Skin,
+    SkinMotion,
+    SkinSurface,
+    SkinWorkspace,
+    motion_of,
+    record_skin,
+    skin_workspace,
+)
 from piavatar_envs.avatar.skinning import blend_places
 from piavatar_envs.core.arrays import vec6
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -298,8 +306,7 @@ class SplatMotion:
         for index, bound in self.bound.items():
             avatar, first = self.simulation.avatars[index], self.slices[index].start
             surface = bound.skin.upload(self._device)
-            unused = wp.zeros((1, 1), dtype=float, device=self._device)
-            motion = fill(SkinMotion(), avatar.body, avatar.tracked, x=self.simulation.state.x, shape=unused)
+            motion = motion_of(avatar, self.simulation.state.x)
             workspace = skin_workspace(surface, len(self.envs), self._device)
             record_skin(graph, self.envs, surface, motion, workspace, self.means, first)
             stencils = bound.upload(self._device)

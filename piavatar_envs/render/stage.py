@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.textures import Textures
-from piavatar_envs.avatar.skin import Skin, SkinMotion, record_skin, skin_bytes, skin_workspace
+from piavatar_envs.avatar.skin import Skin, motion_of, record_skin, skin_bytes, skin_workspace
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.markers import MarkerMeshes, place_markers, unit_mesh, upload_meshes
@@ -247,13 +247,8 @@ class Stage:
         simulation, avatar, flesh = self.simulation, self.simulation.avatars[index], self.simulation.flesh[index]
         varies = flesh.shape.randomize
         surface = self.skins[index].upload(self.device, flesh.asset if varies else None)
-        motion = fill(
-            SkinMotion(),
-            avatar.body,
-            avatar.tracked,
-            x=simulation.state.x,
-            shape=simulation.shapes.parameters(index) if varies else wp.zeros((1, 1), dtype=float, device=self.device),
-        )
+        shape = simulation.shapes.parameters(index) if varies else None
+        motion = motion_of(avatar, simulation.state.x, shape=shape)
         workspace = skin_workspace(surface, self.num_pictures, self.device)
         record_skin(graph, self._shown, surface, motion, workspace, self.vertices, first)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
+from scipy import sparse
 from scipy.spatial import cKDTree
 
 from piavatar_envs.core.structs import fill
@@ -75,6 +76,12 @@ class SolidSurface:
         distance, self._near = cKDTree(self._rest).query(self.vertices, k=near)
         weight = 1.0 / np.maximum(distance, 1e-6) ** 2
         self._weight = weight / weight.sum(axis=1, keepdims=True)
+
+    def weights(self) -> sparse.csr_array:
+        """Return the weights of the particles in the vertices, rows sum to one, shape ``(V, P)``."""
+        near = self._near.reshape(len(self.vertices), -1)
+        rows = np.arange(len(near) + 1) * near.shape[1]
+        return sparse.csr_array((self._weight.ravel(), near.ravel(), rows), shape=(len(near), len(self._rest)))
 
     def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
         """Interpolate a quantity of the particles on the surface, shape ``(P,)`` to ``(V,)``."""
