@@ -116,10 +116,13 @@ class SceneReader:
         self._graph.run()
         vertices = self.stage.vertices.numpy()[0].copy()
         bodies: list[Body] = []
+        garments: list[Body] = []
         markers: list[Marker] = []
         for number, part in enumerate(self.stage.parts):
             own = vertices[part.vertices]
-            if part.kind in ("avatar", "prop"):
+            if part.kind == "garment":
+                garments.append(Body(own, part.faces, part.color, part.colors))
+            elif part.kind in ("avatar", "prop"):
                 splats = self._splats(len(bodies))
                 body = Body(own, part.faces, part.color, part.colors, splats=splats, textures=part.textures)
                 bodies.append(self._colored(body, env, len(bodies), color))
@@ -129,7 +132,7 @@ class SceneReader:
             markers += [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in simulation.avatars]
         follow = np.mean(roots, axis=0) if task.camera_follows else None
-        return Scene(bodies, markers, follow)
+        return Scene([*bodies, *garments], markers, follow)
 
     def _splats(self, index: int) -> MovedSplats | None:
         """Return the splats of a body, if it is drawn as such."""
@@ -361,10 +364,16 @@ def frame_of(target: Target, env: int) -> tuple[np.ndarray, Rotation]:
     return position, Rotation.from_quat(rotation)
 
 
-def grip_at(batch: BatchEnv, env: int, drag: Drag) -> Grip:
-    """Return the bone or prop at the point where a drag began."""
+def grip_at(batch: BatchEnv, env: int, drag: Drag) -> Grip | None:
+    """Return the bone or prop at the point where a drag began; None of a garment that is worn by none."""
     simulation = batch.simulation
     avatars, props = simulation.avatars, simulation.props
+    worn = drag.body - len(avatars) - len(props.props)
+    if worn >= 0:
+        wearer = simulation.garments.garments[worn].wearer
+        if wearer < 0:
+            return None
+        drag = replace(drag, body=wearer)
     mass = simulation.model.particles.mass.numpy()
     mass = mass[min(env, len(mass) - 1)].astype(float)
     if drag.body >= len(avatars):
@@ -411,10 +420,12 @@ class MouseForce:
         if drag is None:
             self._drag = self._grip = None
             return
-        if self._grip is None or drag.start is not self._drag.start:
+        if self._drag is None or drag.start is not self._drag.start:
             self._grip = grip_at(self._batch, self._env, drag)
             self.settle()
         self._drag, grip = drag, self._grip
+        if grip is None:
+            return
         point = grip.point(self._env)
         before = point if self._before is None else self._before
         velocity = (point - before) / self._batch.config.physics.control_dt

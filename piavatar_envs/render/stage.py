@@ -1,6 +1,7 @@
 """The stage: all surfaces of a simulation, computed on its device for any number of its environments.
 
-What stands there never changes: avatars, soft props, the scene's colliders, then the task's markers. Only vertices do.
+What stands there never changes: avatars, soft props, the scene's colliders, the task's markers, then garments. Only
+vertices do.
 They take 12 bytes each a picture, and the particles right beneath a skin as much: some 0.23 MB a picture of the
 embedded body, 0.24 GB of 1,024. All else is shared by the pictures.
 """
@@ -10,22 +11,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.textures import Textures
 from piavatar_envs.avatar.skin import Skin, motion_of, record_skin, skin_bytes, skin_workspace
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
+from piavatar_envs.render.garments import Drapery, bytes_of_garments, garment_names
 from piavatar_envs.render.markers import MarkerMeshes, place_markers, unit_mesh, upload_meshes
 from piavatar_envs.render.scene import PALETTE, PROP, Color
 from piavatar_envs.render.splat_motion import BYTES_OF_SPLAT, SplatMotion
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
+from piavatar_envs.render.wearing import worn_asset
 from piavatar_envs.sim.markers import Markers, MarkerSpec, allocate_markers
 from piavatar_envs.sim.prop_surface import SolidSurface, deform_prop
 from piavatar_envs.sim.world import Simulation
+
+if TYPE_CHECKING:
+    from piavatar_envs.cloth.garment import Garment
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +51,7 @@ class Part:
 
     Attributes:
         name: of the avatar, prop or collider; :data:`MARKERS` of a marker.
-        kind: ``"avatar"``, ``"prop"``, or the kind of the collider or marker.
+        kind: ``"avatar"``, ``"prop"``, ``"garment"``, or the kind of the collider or marker.
         vertices: which of the stage's are its own.
         faces: triangles, counted from its first vertex, shape ``(T, 3)`` int32.
         color: sRGB in [0, 1].
@@ -74,7 +82,8 @@ def bytes_of_stage(simulation: Simulation, markers: Sequence[MarkerSpec] = ()) -
         simulation: the simulated world.
         markers: what the task shows besides.
     """
-    bodies = [(flesh.asset.drawn, len(flesh.points.rest[0])) for flesh in simulation.flesh]
+    assets = _drawn_assets(simulation)
+    bodies = [(asset.drawn, len(own.points.rest[0])) for asset, own in zip(assets, simulation.flesh, strict=True)]
     vertices = sum(len(drawn.vertices) for drawn, _ in bodies)
     vertices += sum(len(solid.vertices) for solid in simulation.props.points)
     kinds = [solid.kind for solid in simulation.subjects.colliders[: len(simulation.subjects.collider_names)]]
@@ -83,7 +92,24 @@ def bytes_of_stage(simulation: Simulation, markers: Sequence[MarkerSpec] = ()) -
     clouds = [(drawn.splats, particles) for drawn, particles in bodies if drawn.splats is not None]
     splats = sum(len(splats.cloud) for splats, _ in clouds)
     skins = sum(skin_bytes(particles) for _, particles in (*bodies, *clouds))
-    return BYTES_OF_VERTEX * vertices + BYTES_OF_SPLAT * splats + skins
+    return BYTES_OF_VERTEX * vertices + BYTES_OF_SPLAT * splats + skins + bytes_of_garments(_garments(simulation))
+
+
+def _garments(simulation: Simulation) -> Sequence[Garment]:
+    """Return the garments of a simulation."""
+    worn = getattr(simulation, "garments", None)
+    return () if worn is None else worn.garments
+
+
+def _drawn_assets(simulation: Simulation) -> list[AvatarAsset]:
+    """Return the assets of all avatars as they are drawn under their garments."""
+    garments = _garments(simulation)
+    if not garments:
+        return [flesh.asset for flesh in simulation.flesh]
+    return [
+        worn_asset(flesh, [own for own in garments if own.wearer == index])
+        for index, flesh in enumerate(simulation.flesh)
+    ]
 
 
 @wp.kernel
@@ -106,7 +132,7 @@ class Stage:
         num_pictures: number of pictures, the first dimension of :attr:`vertices`.
         envs: environment of each picture, ``(num_pictures,)`` int32.
         parts: what stands there, in the order of the vertices.
-        subjects: names by label: the ground, avatars, props, colliders, and all markers together.
+        subjects: names by label: the ground, avatars, props, colliders, all markers together, and every garment.
         skins, solids: the surfaces of every avatar and prop.
         splats: the splats of all avatars that are drawn as such; None without any.
         vertices: in the world [m], ``(num_pictures, vertices)``; NaN of a marker that is hidden.
@@ -134,7 +160,9 @@ class Stage:
         boundaries = simulation.subjects.colliders[: len(simulation.subjects.collider_names)]
         self._colliders = [i for i, solid in enumerate(boundaries) if solid.kind in _DRAWN_COLLIDERS]
         solids = tuple(simulation.subjects.collider_names[i] for i in self._colliders)
-        self.subjects = ("ground", *names, *solids, *([MARKERS] if markers else []))
+        worn = garment_names(_garments(simulation), names)
+        self.subjects = ("ground", *names, *solids, *([MARKERS] if markers else []), *worn)
+        self._assets, self._drapery = _drawn_assets(simulation), Drapery(_garments(simulation))
         self.skins = [self._bake(index) for index in range(len(simulation.avatars))]
         self.solids = [SolidSurface(own.rest, own.vertices, own.faces) for own in simulation.props.points]
         self._list_parts(names, markers)
@@ -177,15 +205,15 @@ class Stage:
         """Return the skin of an avatar, with the weights of its configured shape."""
         flesh = self.simulation.flesh[avatar]
         points, _ = flesh.shaped(flesh.base_parameters)
-        body = flesh.asset.shape_drawn(flesh.base_parameters)
+        asset = self._assets[avatar]
         skinning = points.rest[0], points.skin_joints, points.skin_weights
-        return Skin.baked(flesh.asset.drawn, body, *skinning, points.correctives)
+        return Skin.baked(asset.drawn, asset.shape_drawn(flesh.base_parameters), *skinning, points.correctives)
 
     def _list_parts(self, names: Sequence[str], markers: Sequence[MarkerSpec]) -> None:
         """Lay the meshes of all parts one after the other."""
         simulation, avatars = self.simulation, len(self.simulation.avatars)
-        for index, flesh in enumerate(simulation.flesh):
-            drawn = flesh.asset.drawn
+        for index, asset in enumerate(self._assets):
+            drawn = asset.drawn
             color = PALETTE[index % len(PALETTE)]
             given = len(drawn.vertices), drawn.faces, color, drawn.colors_of(index), drawn.textures
             self._add(1 + index, "avatar", *given)
@@ -197,7 +225,11 @@ class Stage:
             self._add(subject, kind, len(local), faces, PROP)
         for spec in markers:
             local, faces = unit_mesh(spec.kind)
-            self._add(len(self.subjects) - 1, spec.kind, len(local), faces, spec.color)
+            self._add(1 + len(names) + len(self._colliders), spec.kind, len(local), faces, spec.color)
+        first = len(self.subjects) - len(self._drapery.meshes)
+        for subject, mesh in enumerate(self._drapery.meshes, first):
+            color = tuple(float(value) / 255.0 for value in mesh.colors[0])
+            self._add(subject, "garment", mesh.num_vertices, mesh.faces, color, mesh.colors)
 
     def _add(
         self, subject: int, kind: str, count: int, faces: np.ndarray, color: Color, colors: np.ndarray | None = None,
@@ -239,14 +271,19 @@ class Stage:
             self._record_solids(graph, meshes, self._placed_colliders(), next(first))
         if self._specs:
             meshes = upload_meshes([s.kind for s in self._specs], [s.size for s in self._specs], self.device)
-            self._record_solids(graph, meshes, self.markers, self.parts[-len(self._specs)].vertices.start)
+            own = self.parts[len(self.parts) - len(self._drapery.meshes) - len(self._specs)]
+            self._record_solids(graph, meshes, self.markers, own.vertices.start)
+        if self._drapery.meshes:
+            cloth, begin = self.simulation.garments.cloth.state.x, self.parts[-1].vertices.stop
+            begin -= self._drapery.num_vertices
+            self._drapery.record(graph, self._shown, cloth, self.vertices, begin, self.device)
         return graph
 
     def _record_skin(self, graph: LaunchGraph, index: int, first: int) -> None:
         """Append the skin of an avatar."""
         simulation, avatar, flesh = self.simulation, self.simulation.avatars[index], self.simulation.flesh[index]
         varies = flesh.shape.randomize
-        surface = self.skins[index].upload(self.device, flesh.asset if varies else None)
+        surface = self.skins[index].upload(self.device, self._assets[index] if varies else None)
         shape = simulation.shapes.parameters(index) if varies else None
         motion = motion_of(avatar, simulation.state.x, shape=shape)
         workspace = skin_workspace(surface, self.num_pictures, self.device)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import ConvexHull, cKDTree
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, Look, area_vectors, dense_weights, top_weights, turned_shares
+from piavatar_envs.avatar.body.asset import AvatarAsset, Look, dense_weights, top_weights, turned_shares, vertex_normals
 from piavatar_envs.avatar.body.eyes import find_eyes
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 
@@ -76,12 +76,17 @@ KITS = (
 )
 
 
-def dressed(asset: AvatarAsset) -> Look:
-    """Return a body's skin in clothes, with a colouring for each of :data:`KITS`."""
+def dressed(asset: AvatarAsset, with_shirt: bool = True) -> Look:
+    """Return a body's skin in clothes, with a colouring for each of :data:`KITS`.
+
+    Args:
+        asset: the body.
+        with_shirt: whether it wears a shirt; not where a garment is worn instead.
+    """
     at = {name: asset.joints[index].astype(np.float64) for index, name in enumerate(JOINT_NAMES)}
     shares = turned_shares(asset.skin_joints, asset.skin_weights)
     share = {name: shares[:, index] for index, name in enumerate(JOINT_NAMES)}
-    points, garments = asset.vertices.astype(np.float64), (_shirt, _shorts, _hair, _foot)
+    points, garments = asset.vertices.astype(np.float64), (_shirt if with_shirt else _nothing, _shorts, _hair, _foot)
     fields = np.stack([garment(points, at, share) for garment in garments], axis=1)
     points = _smoothed(points, asset.faces, fields[:, :3].max(axis=1))
     fields = np.stack([garment(points, at, share) for garment in garments], axis=1)
@@ -92,7 +97,7 @@ def dressed(asset: AvatarAsset) -> Look:
     faces = faces[(fields[faces, 3] < _SOLE).any(axis=1)]  # the foot in a shoe is not seen
     used, faces = np.unique(faces, return_inverse=True)
     blend, fields, faces = blend[used], fields[used], faces.reshape(-1, 3)
-    normals = blend @ _normals(points, asset.faces)
+    normals = blend @ vertex_normals(points, asset.faces)
     weights = blend @ dense_weights(asset.skin_joints, asset.skin_weights)
     skin = _Surface(blend @ points + _heights(fields) * normals, faces, _materials(fields), blend, weights)
     pieces = [skin, *(_shoe(asset, points, at, share, side) for side in _SIDES), *_eyes(asset, at)]
@@ -134,6 +139,11 @@ def _shirt(points: np.ndarray, at: dict[str, np.ndarray], share: dict[str, np.nd
     lower = np.array([0.0, 0.5, -1.0]) / np.hypot(0.5, 1.0)  # its collar is lower in front
     field = np.minimum((points - neck - [0.0, 0.0, 0.012]) @ lower, points[:, 2] - pelvis[2] - 0.02)
     return np.minimum(field, _short_of(points, at, share, "shoulder", "elbow", 0.46))
+
+
+def _nothing(points: np.ndarray, _at: dict[str, np.ndarray], _share: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the field of what is not worn."""
+    return np.full(len(points), -1.0)
 
 
 def _shorts(points: np.ndarray, at: dict[str, np.ndarray], share: dict[str, np.ndarray]) -> np.ndarray:
@@ -211,14 +221,6 @@ def _heights(fields: np.ndarray) -> np.ndarray:
     shirt, shorts, hair = fields.T[:3]
     height = np.where(hair > 0.0, _HAIR * np.clip(0.25 + hair / 0.03, 0.0, 1.0), 0.0)
     return np.where(shirt > 0.0, _SHIRT, np.where(shorts > 0.0, _SHORTS, height))[:, None]
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return unit normals of vertices, shape ``(V, 3)``."""
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], area_vectors(vertices, faces))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def cut_triangles(field: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_array, np.ndarray]:

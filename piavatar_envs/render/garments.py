@@ -1,0 +1,223 @@
+"""Garments as they are drawn: smooth between the vertices of their cloth, with two sides and a hem.
+
+A garment's mesh is divided until folds look round (:mod:`.subdivision`). Every point of it is drawn twice, half of the
+cloth's drawn thickness out and in along the normal, and borders are closed, so that each side has its own colour and
+light, and programs that read films find a closed surface.
+
+Symbols in kernels: ``i`` picture, ``e = envs[i]`` its environment, ``v`` vertex of cloth, ``w`` point of the finer one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.structs import fill
+from piavatar_envs.render.subdivision import levels_for, subdivided
+
+if TYPE_CHECKING:
+    from piavatar_envs.cloth.garment import Garment
+
+wp.set_module_options({"enable_backward": False})
+
+#: Greatest mean edge that is drawn, and half of the thickness of the drawn cloth [m].
+_EDGE, _HALF = 0.016, 0.001
+
+
+@dataclass(frozen=True, eq=False)
+class GarmentMesh:
+    """Two sides of a garment.
+
+    Attributes:
+        rows: shares of the ``V`` vertices of its cloth in its points: offsets ``(W + 1,)``, vertices and weights.
+        faces: closed, outward triangles over ``2 W`` vertices, the outer side first, shape ``(U, 3)`` int32.
+        colors: sRGB of these vertices, shape ``(2 W, 3)`` uint8.
+    """
+
+    rows: tuple[np.ndarray, np.ndarray, np.ndarray]
+    faces: np.ndarray
+    colors: np.ndarray
+
+    @staticmethod
+    def of(garment: Garment) -> GarmentMesh:
+        """Divide a garment, close its borders, and colour its sides."""
+        levels = levels_for(garment.mesh.faces, garment.draped, _EDGE)
+        fine = subdivided(garment.mesh.faces, garment.mesh.num_vertices, levels)
+        matrix, sides = fine.matrix, np.array([garment.fabric.front, garment.fabric.back])
+        colors = np.rint(255.0 * np.clip(sides, 0.0, 1.0)).astype(np.uint8)
+        rows = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
+        return GarmentMesh(rows, both_sides(fine.faces, matrix.shape[0]), np.repeat(colors, matrix.shape[0], axis=0))
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of its vertices, those of both sides."""
+        return len(self.colors)
+
+
+def both_sides(faces: np.ndarray, count: int) -> np.ndarray:
+    """Return the triangles of a closed surface around a sheet: its two sides, and strips along its borders.
+
+    Args:
+        faces: of the sheet of ``count`` vertices, shape ``(T, 3)``; those of the other side are counted after them.
+        count: number of its vertices.
+    """
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    alone = ~np.isin(start * count + end, end * count + start)
+    a, b = start[alone], end[alone]
+    strips = [np.stack([b, a, a + count], axis=1), np.stack([b, a + count, b + count], axis=1)]
+    return np.concatenate([faces, faces[:, ::-1] + count, *strips]).astype(np.int32)
+
+
+@wp.struct
+class ClothSurface:
+    """Constants of all garments of a world: ``V`` vertices of cloth, ``W`` points that are drawn on both sides."""
+
+    triangles: wp.array(dtype=wp.vec3i)  # of the cloth
+    fan_start: wp.array(dtype=int)  # (V + 1,)
+    fan: wp.array(dtype=int)  # triangles around a vertex
+    start: wp.array(dtype=int)  # (W + 1,)
+    vertex: wp.array(dtype=int)  # that move a point
+    weight: wp.array(dtype=float)
+    outer: wp.array(dtype=int)  # (W,) drawn vertex of a point's outer side
+    inner: wp.array(dtype=int)  # (W,) and of its inner side
+
+
+@wp.kernel
+def find_cloth_normals(
+    envs: wp.array(dtype=int), surface: ClothSurface, x: wp.array2d(dtype=wp.vec3), normals: wp.array2d(dtype=wp.vec3)
+):
+    """Write unit normals of the vertices of cloth, over ``(pictures, V)``."""
+    i, v = wp.tid()
+    e = envs[i]
+    if e < 0:
+        return
+    total = wp.vec3()
+    for k in range(surface.fan_start[v], surface.fan_start[v + 1]):
+        corner = surface.triangles[surface.fan[k]]
+        origin = x[e, corner[0]]
+        total += wp.cross(x[e, corner[1]] - origin, x[e, corner[2]] - origin)
+    normals[i, v] = wp.normalize(total)
+
+
+@wp.kernel
+def place_cloth(
+    envs: wp.array(dtype=int),
+    surface: ClothSurface,
+    x: wp.array2d(dtype=wp.vec3),
+    normals: wp.array2d(dtype=wp.vec3),
+    half: float,
+    first: int,
+    # out
+    vertices: wp.array2d(dtype=wp.vec3),
+):
+    """Write both sides of the garments, from vertex ``first`` of every picture on; over ``(pictures, W)``."""
+    i, w = wp.tid()
+    e = envs[i]
+    if e < 0:
+        return
+    at = wp.vec3()
+    normal = wp.vec3()
+    for k in range(surface.start[w], surface.start[w + 1]):
+        v = surface.vertex[k]
+        at += surface.weight[k] * x[e, v]
+        normal += surface.weight[k] * normals[i, v]
+    aside = half * wp.normalize(normal)
+    vertices[i, first + surface.outer[w]] = at + aside
+    vertices[i, first + surface.inner[w]] = at - aside
+
+
+class Drapery:
+    """The drawn surfaces of all garments of a world.
+
+    Attributes:
+        meshes: of every garment; their vertices follow one another in this order.
+    """
+
+    def __init__(self, garments: Sequence[Garment]) -> None:
+        """Divide the garments, which follow one another among the vertices of the cloth."""
+        self.meshes = [GarmentMesh.of(garment) for garment in garments]
+        self._cloth = [garment.mesh for garment in garments]
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of all drawn vertices."""
+        return sum(mesh.num_vertices for mesh in self.meshes)
+
+    @property
+    def num_points(self) -> int:
+        """Number of vertices of the cloth."""
+        return sum(mesh.num_vertices for mesh in self._cloth)
+
+    def record(
+        self, graph: LaunchGraph, envs: wp.array, x: wp.array, vertices: wp.array, first: int, device: str
+    ) -> None:
+        """Append the launches that write the garments of pictures.
+
+        Args:
+            graph: the launch graph to append to.
+            envs: environment of each picture, ``(pictures,)`` int32; a picture of a negative one keeps its vertices.
+            x: positions of the cloth [m], ``(num_envs, V)``.
+            vertices: of all pictures ``(pictures, ...)`` [m].
+            first: index of the first garment's first vertex.
+            device: of the arrays.
+        """
+        surface, pictures = self._upload(device), len(envs)
+        normals = wp.zeros((pictures, self.num_points), dtype=wp.vec3, device=device)
+        graph.launch(find_cloth_normals, normals.shape, [envs, surface, x], [normals])
+        shape = (pictures, self.num_vertices // 2)
+        graph.launch(place_cloth, shape, [envs, surface, x, normals, _HALF, first], [vertices])
+
+    def _upload(self, device: str) -> ClothSurface:
+        """Return the constants on a device."""
+        ends = np.cumsum([0, *(cloth.num_vertices for cloth in self._cloth)])
+        triangles = np.concatenate([cloth.faces + begin for cloth, begin in zip(self._cloth, ends, strict=False)])
+        corners = triangles.ravel()
+        fan_start = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=ends[-1]))])
+        outer, inner, counts, columns, weights, first = [], [], [], [], [], 0
+        for mesh, begin in zip(self.meshes, ends, strict=False):
+            points, (start, vertex, weight) = mesh.num_vertices // 2, mesh.rows
+            outer.append(first + np.arange(points))
+            inner.append(first + points + np.arange(points))
+            counts.append(np.diff(start))
+            columns.append(vertex + begin)
+            weights.append(weight)
+            first += mesh.num_vertices
+
+        def upload(values: np.ndarray, dtype: type) -> wp.array:
+            numbers = np.float32 if dtype is float else np.int32
+            return wp.array(np.ascontiguousarray(values, numbers), dtype=dtype, device=device)
+
+        return fill(
+            ClothSurface(),
+            triangles=upload(triangles, wp.vec3i),
+            fan_start=upload(fan_start, int),
+            fan=upload(np.argsort(corners, kind="stable") // 3, int),
+            start=upload(np.concatenate([[0], np.cumsum(np.concatenate(counts))]), int),
+            vertex=upload(np.concatenate(columns), int),
+            weight=upload(np.concatenate(weights), float),
+            outer=upload(np.concatenate(outer), int),
+            inner=upload(np.concatenate(inner), int),
+        )
+
+
+def bytes_of_garments(garments: Sequence[Garment]) -> int:
+    """Return the memory of a picture's garments, drawn vertices and normals of the cloth [bytes]."""
+    drawn = sum(GarmentMesh.of(garment).num_vertices for garment in garments)
+    return 12 * (drawn + sum(garment.mesh.num_vertices for garment in garments))
+
+
+def garment_names(garments: Sequence[Garment], wearers: Sequence[str]) -> list[str]:
+    """Return names of garments: of the wearer and the kind, numbered where a wearer has two of a kind.
+
+    Args:
+        garments: the garments.
+        wearers: names of the avatars.
+    """
+    plain = [f"{wearers[own.wearer]}.{own.kind}" if own.wearer >= 0 else own.kind for own in garments]
+    before = [plain[:index].count(name) for index, name in enumerate(plain)]
+    return [f"{name}_{count}" if count else name for name, count in zip(plain, before, strict=True)]
