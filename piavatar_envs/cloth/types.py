@@ -13,34 +13,6 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Impulses [N s] and moments [N m s] are added up in multiples of it.
-QUANTUM = 2.0**-40
-
-
-@wp.struct
-class Obstacles:
-    """Surfaces that cloth touches: ``P`` pieces, one after another, of ``N`` points and ``T`` triangles in all.
-
-    During a control step every point goes straight from ``start`` to ``end``. ``impulse`` is added to; the owner of the
-    surfaces clears it.
-    """
-
-    start: wp.array2d(dtype=wp.vec3)  # (num_envs, N) positions before the control step [m]
-    end: wp.array2d(dtype=wp.vec3)  # (num_envs, N) after it [m]
-    start_normal: wp.array2d(dtype=wp.vec3)  # (num_envs, N) smooth outward unit normals
-    end_normal: wp.array2d(dtype=wp.vec3)
-    faces: wp.array(dtype=wp.vec3i)  # (T,) corners, counted over all pieces
-    ring_start: wp.array(dtype=int)  # (N + 1,)
-    ring: wp.array(dtype=int)  # neighbors of a point, ascending
-    fan_start: wp.array(dtype=int)  # (N + 1,)
-    fan: wp.array(dtype=int)  # triangles of a point
-    part: wp.array(dtype=int)  # (N,) bits of the part of a body; -1 for props
-    piece_start: wp.array(dtype=int)  # (P + 1,) first point of a piece
-    face_start: wp.array(dtype=int)  # (P + 1,) first triangle of a piece
-    post_start: wp.array(dtype=int)  # (P + 1,)
-    post: wp.array(dtype=int)  # points from which searches begin, evenly spread over a piece
-    impulse: wp.array3d(dtype=wp.int64)  # (num_envs, N, 6) impulse, then moment about ``end``, in QUANTUM
-
 
 @dataclass(frozen=True)
 class ClothSettings:
@@ -83,3 +55,15 @@ class ClothState:
     x: wp.array2d(dtype=wp.vec3)  # (num_envs, V) [m]
     v: wp.array2d(dtype=wp.vec3)  # (num_envs, V) [m/s]
     near: wp.array3d(dtype=int)  # (num_envs, V, 2) nearest point of the wearer and of all other pieces; -1: not known
+
+
+@wp.struct
+class Fabrics:
+    """Properties of ``G`` garments, each ``(rows, G)``; see :class:`piavatar_envs.cloth.fabric.Fabric`."""
+
+    areal_density: wp.array2d(dtype=float)  # [kg/m^2]
+    stretch: wp.array2d(dtype=float)  # [N/m]
+    bending: wp.array2d(dtype=float)  # [N m]
+    friction: wp.array2d(dtype=float)
+    drag: wp.array2d(dtype=float)  # [kg/m^3]
+    skin_drag: wp.array2d(dtype=float)  # [kg/m^3]

@@ -1,0 +1,90 @@
+"""Batches of cloth: bit for bit their singles, in any order of threads; failed environments."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from piavatar_envs.mpm.colliders import Collider, make_boundaries
+from piavatar_envs.mpm.types import FAILURE_CLOTH
+from tests.cloth.sheets import LINEN, Run, flat_sheet, garment, hanging_sheet, move, sphere, surfaces
+from tests.gpu_on_cpu import gpu_on_cpu
+
+#: Places of the balls that sheets fall on, one an environment [m].
+STARTS = (0.0, 0.03, 0.06)
+
+
+def fall(starts, device: str = "cpu", steps: int = 12) -> Run:
+    """Let two sheets fall on two balls, the second piece another's, and a floor; every ball moves its own way."""
+    ball = sphere(0.08, rings=5)
+    o = surfaces(ball, ball, num_envs=len(starts), device=device)
+    points, faces = flat_sheet(0.2, 0.2, 0.04, z=0.09)
+    fabric = replace(LINEN, bending=2e-5, drag=0.6, skin_drag=0.02)
+    sheets = [
+        garment(points + [0.02, 0.01, 0.01 * wearer], faces, fabric, wearer=wearer, thickness=0.004 + 0.002 * wearer)
+        for wearer in range(2)
+    ]
+    floor = make_boundaries([Collider.plane((0, 0, 1), -0.02)], 1, 1, device)
+    run = Run(*sheets, obstacles=o, boundaries=floor, num_envs=len(starts), device=device)
+    middle = np.concatenate([ball[0], ball[0] + [0.1, 0.0, 0.0]])
+    for n in range(steps):
+        move(o, np.stack([middle + [start, 0.0, 0.002 * n * start / 0.03] for start in starts]))
+        run.steps(1)
+    return run
+
+
+def results(run: Run, e: int) -> list[bytes]:
+    """Return all that a control step has changed in an environment."""
+    return [array.numpy()[e].tobytes() for array in (*run.cloth.arrays().values(), run.obstacles.impulse)]
+
+
+def test_a_batch_is_its_singles_and_runs_repeat(device):
+    batch = fall(STARTS, device)
+    assert results(batch, 0) != results(batch, 1) and not batch.failure.numpy().any()
+    again = fall(STARTS, device)
+    for e, start in enumerate(STARTS):
+        alone = fall([start], device)  # emulated, each launch begins in another order of threads
+        assert results(batch, e) == results(alone, 0) == results(again, e)
+
+
+def test_a_gpu_does_the_same_up_to_rounding():
+    with gpu_on_cpu() as device:
+        emulated = fall(STARTS[:2], device, steps=6)
+        assert emulated.cloth.threads > 1
+    plain = fall(STARTS[:2], steps=6)
+    for e in range(2):
+        for name, size in (("x", 1e-5), ("v", 1e-3)):
+            assert np.abs(emulated.get(name, e) - plain.get(name, e)).max() < size
+        books = [run.obstacles.impulse.numpy()[e].sum(axis=0)[:3] for run in (emulated, plain)]
+        assert books[0] == pytest.approx(books[1], rel=1e-3, abs=1e-4 * np.abs(books[1]).max())
+
+
+def test_a_failed_environment_is_frozen_and_one_that_is_not_finite_fails(device):
+    points, faces, top = hanging_sheet(0.2, 0.2, 0.05)
+    run = Run(garment(points, faces, held=top), num_envs=3, device=device)
+    v = np.zeros((3, len(points), 3), np.float32)
+    v[1, -1, 2] = np.nan
+    run.put(v=v)
+    run.failure.assign(np.array([0, 0, 4], np.int32))
+    run.steps(2)
+    assert run.failure.numpy().tolist() == [0, FAILURE_CLOTH, 4]
+    assert np.array_equal(run.get("x", 2), points.astype(np.float32)) and np.isfinite(run.get("x", 0)).all()
+    alone = Run(garment(points, faces, held=top), device=device).steps(2)
+    assert run.get("x", 0).tobytes() == alone.get("x").tobytes()
+
+
+def test_environments_may_have_their_own_fabric_and_lengths(device):
+    points, faces, top = hanging_sheet(0.1, 0.2, 0.05)
+    run = Run(garment(points, faces, replace(LINEN, stretch=20.0), held=top), num_envs=2, rows=2, device=device)
+    fabric, cloth = run.cloth.fabric, run.cloth
+    fabric.stretch.assign(np.array([[20.0], [40.0]], np.float32))
+    fabric.areal_density.assign(np.array([[0.2], [0.4]], np.float32))
+    cloth.length.assign(np.stack([cloth.mesh.length, 1.1 * cloth.mesh.length]).astype(np.float32))
+    run.steps(60 if device == "cpu" else 2)
+    assert cloth.mass[1] == pytest.approx(2.0 * cloth.mass[0])
+    if device == "cpu":
+        long = [-run.get("x", e)[:, 2].min() / 0.2 for e in range(2)]
+        assert long[0] == pytest.approx(1.0 + 0.2 * 9.81 * 0.2 / 40.0, rel=5e-3)
+        assert long[1] / long[0] == pytest.approx(1.1, rel=2e-3)  # twice the weight on twice the stiffness
