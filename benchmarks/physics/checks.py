@@ -113,9 +113,9 @@ class Check:
 
     name: str
     title: str
-    measure: Callable[[Options], Iterator[Quantity]]
+    measure: Callable[[Any], Iterator[Quantity]]
 
-    def rows(self, options: Options) -> Iterator[dict[str, Any]]:
+    def rows(self, options: Any) -> Iterator[dict[str, Any]]:
         """Yield a row per quantity; one that fails with the reason if the simulation ends early."""
         try:
             for quantity in self.measure(options):
@@ -132,6 +132,8 @@ class Check:
             "unit": quantity.unit,
             "theory": quantity.theory,
             "limit": quantity.limit,
+            "bound": quantity.bound,
+            "tolerance": quantity.tolerance,
             "value": quantity.value if math.isfinite(quantity.value) else None,
             "verdict": quantity.verdict,
             "note": quantity.note,
@@ -142,27 +144,29 @@ class Check:
 CHECKS: dict[str, Check] = {}
 
 
-def check(name: str, title: str) -> Callable[[Callable[[Options], Iterator[Quantity]]], Check]:
-    """Register a function as the check ``name``."""
+def check(
+    name: str, title: str, among: dict[str, Check] = CHECKS
+) -> Callable[[Callable[[Any], Iterator[Quantity]]], Check]:
+    """Register a function as the check ``name`` among others."""
 
-    def register(measure: Callable[[Options], Iterator[Quantity]]) -> Check:
-        CHECKS[name] = Check(name, title, measure)
-        return CHECKS[name]
+    def register(measure: Callable[[Any], Iterator[Quantity]]) -> Check:
+        among[name] = Check(name, title, measure)
+        return among[name]
 
     return register
 
 
-def chosen(only: Iterable[str]) -> list[Check]:
-    """Return the checks whose names begin with one of ``only``; all if it is empty.
+def chosen(only: Iterable[str], among: Mapping[str, Check] = CHECKS) -> list[Check]:
+    """Return the checks among some whose names begin with one of ``only``; all if it is empty.
 
     Raises:
         SystemExit: a beginning fits no check.
     """
     only = tuple(only)
     for beginning in only:
-        if not any(name.startswith(beginning) for name in CHECKS):
-            raise SystemExit(f"--only {beginning}: no such check; the checks are {', '.join(CHECKS)}")
-    return [found for name, found in CHECKS.items() if not only or name.startswith(only)]
+        if not any(name.startswith(beginning) for name in among):
+            raise SystemExit(f"--only {beginning}: no such check; the checks are {', '.join(among)}")
+    return [found for name, found in among.items() if not only or name.startswith(only)]
 
 
 def table(rows: Iterable[Mapping[str, Any]]) -> str:

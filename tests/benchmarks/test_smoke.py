@@ -16,7 +16,7 @@ from agents import files
 from benchmarks import runner
 from benchmarks.paper import acts, disturbance, figures, measures, supplement, tracking
 from benchmarks.paper.stage import Act, keyed, perform
-from benchmarks.physics import blows, contact, elastodynamics, stability, torque, wear
+from benchmarks.physics import blows, contact, elastodynamics, sources, stability, torque, wear
 from benchmarks.physics.limbs import Options
 from benchmarks.physics.rig import Rig, World
 from benchmarks.speed import cpu, failures, pixels, plain_mpm, profile, soak, steps, vector
@@ -49,6 +49,17 @@ def test_pictures_are_counted(tmp_path, device):
     assert row["refused"] is None and (row["num_envs"], row["size"]) == (2, 16)
     assert min(row[name] for name in ("frames_per_s", "drawing_only", "without_pixels", "with_autoreset")) > 0.0
     assert len(row["drawing_ms_by_kernel"]) > 5 and row["launches_of_drawing"] > 5
+
+
+def test_avatars_of_a_source_act_at_random(tmp_path, device):
+    arguments = ("--fidelity", "tiny", "--num-envs", "3", "--steps", "3", "--worlds", "PIAvatar/Reach-v0", "sumo_v0")
+    rows = run(sources, tmp_path / "sources.json", device, *arguments)
+    check_finite(rows)
+    assert [(row["source"], row["agents"], row["failures"], row["nonfinite"]) for row in rows] == [
+        ("embedded", agents, {}, 0) for agents in (1, 2)
+    ]
+    chosen = ("avatar.source=gaussian", "avatar.path=a.glb")
+    assert sources.settings_of("a.glb#gaussian") == ("gaussian", chosen)
 
 
 def test_vector_rates_are_consistent(tmp_path, device):
