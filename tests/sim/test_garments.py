@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs.cloth.obstacles import QUANTUM, ObstacleSurfaces
+from piavatar_envs.cloth.proxy import LEFT_ARM
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.render.stage import Stage
@@ -112,3 +113,28 @@ def test_a_failed_environment_receives_nothing(make_env):
     np.testing.assert_array_equal(simulation.state.u.numpy(), before)
     assert not surfaces.obstacles.impulse.numpy().any()
     simulation.state.failure.assign([0])
+
+
+@pytest.mark.parametrize("mode", ["pose", "pd", "pd on the ground"])
+def test_the_body_carries_a_steady_load_of_its_surface(make_env, mode):
+    # 20 N down on an arm, given after every control step, reach what holds the root, and the ground
+    settings = {"pose": EMPTY, "pd": {"control": "pd", "root_assist": 1.0, "pose_noise": 0.0, **EMPTY}}
+    settings["pd on the ground"] = {"control": "pd", "root_assist": 1.0, "pose_noise": 0.0, "episode_seconds": 100.0}
+    env = make_env("PIAvatar/Reach-v0" if mode == "pose" else STAND, **settings[mode])
+    simulation, dt = env.batch.simulation, env.config.physics.control_dt
+    surfaces = surfaces_of(simulation)
+    end = recorded(env.batch.device, surfaces.record_end)
+    react = recorded(env.batch.device, lambda graph: surfaces.record_reaction(graph, simulation.state))
+    arm = surfaces.obstacles.part.numpy() == LEFT_ARM
+    load = np.zeros((len(arm), 3))
+    load[arm, 2] = -20.0 * dt / arm.sum()
+    weight = 9.81 * simulation.model.particles.mass.numpy()[0].sum() if "ground" in mode else 0.0
+    env.reset(seed=0)
+    held = []
+    for _ in range(80):
+        end.run()
+        give(surfaces, load, 0.0 * load)
+        react.run()
+        info = env.step(np.zeros(env.action_space.shape, np.float32))[4]
+        held.append(info["root_force"][2] + simulation.sensors.boundary_impulse.numpy()[0, 0, 2] / dt)
+    assert np.mean(held[-10:]) == pytest.approx(weight + 20.0, abs=0.2)
