@@ -462,17 +462,15 @@ def bone_surface(
     skin_weights: np.ndarray,
     device: str,
     deltas: np.ndarray | None = None,
-    pelvis: np.ndarray | None = None,
 ) -> SkinSurface:
     """Return a surface on a device that only bones move, for :func:`record_skin`.
 
     Args:
-        rest: vertices in the rest pose, or where the mean shape is if there are ``deltas`` [m], shape ``(V, 3)``.
+        rest: vertices in the rest pose, of the mean shape if there are ``deltas`` [m], shape ``(V, 3)``.
         skin_joints: joints that move each vertex, shape ``(V, 4)``.
         skin_weights: their weights, shape ``(V, 4)``.
         device: Warp device.
         deltas: displacements at -1 and at +1 of each shape parameter [m], shape ``(2 S, V, 3)``.
-        pelvis: that of the mean shape, and its displacements likewise [m], shape ``(1 + 2 S, 3)``.
     """
     none = np.zeros((0, len(rest)))
     return _upload(
@@ -483,7 +481,7 @@ def bone_surface(
         weight=none,
         used=np.zeros(0),
         deltas=np.zeros((0, len(rest), 3)) if deltas is None else deltas,
-        pelvis=np.zeros((1, 3)) if pelvis is None else pelvis,
+        pelvis=np.zeros((1, 3)),
         directions=np.zeros((0, TILE, 3)),
         reference=np.tile(np.eye(3), (NUM_JOINTS, 1, 1)),
     )

@@ -23,7 +23,7 @@ SETTINGS = "env.settings"
 #: Settings without effect on the future, and the setting that a state holds as a number of its own.
 _SHOWN, _BEGUN_WITH = ("render", "pixels", "obs_mode"), "root_assist"
 #: Arrays that may hold numbers that are not finite: the next step finds them and ends the episode with a failure.
-_FOUND_BY_STEPS = ("particles.x", "particles.u", "particles.C", "particles.F")
+_FOUND_BY_STEPS = ("particles.x", "particles.u", "particles.C", "particles.F", "cloth.x", "cloth.v")
 #: How the names of external forces begin; a state has them only after the first force.
 FORCES = "forces."
 #: How the names of shares of root assistance end.

@@ -112,8 +112,9 @@ def check_memory(
     num_fields: int = 1,
     num_blocks: int = 0,
     path: str = "plain",
+    more_bytes: int = 0,
 ) -> None:
-    """Check that a batch fits into memory.
+    """Check that a batch fits into memory, with ``more_bytes`` that an environment needs besides state and scratch.
 
     Raises:
         ValueError: the estimate exceeds the free memory of a CUDA device.
@@ -122,6 +123,7 @@ def check_memory(
     if not target.is_cuda:
         return
     need = estimate_bytes(num_envs, num_particles, max_active_blocks, num_fields, num_blocks, path)
+    need += num_envs * more_bytes
     if need > target.free_memory:
         fits = int(num_envs * target.free_memory / need)
         raise ValueError(

@@ -299,6 +299,7 @@ def build_model(
     max_active_blocks: int | None = None,
     rest: np.ndarray | None = None,
     path: str | None = None,
+    more_bytes: int = 0,
 ) -> Model:
     """Return the constants of a simulation on ``device``.
 
@@ -320,6 +321,7 @@ def build_model(
         rest: positions at rest [m], shape ``(P, 3)``, from which tiles of large bodies are made compact.
         path: one of ``PATHS``; if not given, ``"block"`` on a GPU whose shared memory holds an environment's grid, else
             ``"tiled"`` on a GPU of compute capability 7.0 or more, else ``"plain"``.
+        more_bytes: memory that an environment needs besides, which must be free as well.
 
     Raises:
         ValueError: bad material, unstable time step, a path that the device does not support, or too little memory.
@@ -338,7 +340,8 @@ def build_model(
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
     max_active_blocks = bound_active_blocks(max_active_blocks, points.fields, grid, fields.num_fields)
     path = choose_path(path, device, points.fields, max_active_blocks, decoupling)
-    check_memory(num_envs, points.num_particles, max_active_blocks, device, fields.num_fields, grid.num_blocks, path)
+    layout = max_active_blocks, device, fields.num_fields, grid.num_blocks, path
+    check_memory(num_envs, points.num_particles, *layout, more_bytes=more_bytes)
     thin = thin_colliders(colliders, grid.dx)
     step = Step()
     step.dt = control_dt / num_substeps

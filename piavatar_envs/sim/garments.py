@@ -6,18 +6,36 @@ has given to the surfaces. Nothing but the cloth itself is carried from one step
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
 from scipy import sparse
 
 from piavatar_envs.avatar.avatar import Avatar
-from piavatar_envs.avatar.skin import Skin, motion_of, record_skin, skin_workspace
-from piavatar_envs.cloth.obstacles import Piece
-from piavatar_envs.cloth.proxy import ALL_PARTS, proxy_of
+from piavatar_envs.avatar.skin import (
+    Skin,
+    SkinSurface,
+    bone_surface,
+    motion_of,
+    record_skin,
+    skin_bytes,
+    skin_workspace,
+    with_shape,
+)
+from piavatar_envs.cloth.garment import Garment
+from piavatar_envs.cloth.mesh import ClothMesh
+from piavatar_envs.cloth.obstacles import ObstacleSurfaces, Piece, bytes_of_obstacles
+from piavatar_envs.cloth.proxy import ALL_PARTS, PROXY_VERTICES, proxy_of
 from piavatar_envs.cloth.remesh import remesh
+from piavatar_envs.cloth.solver import Cloth
+from piavatar_envs.cloth.tailor import make_garment
+from piavatar_envs.cloth.types import ClothSettings, ClothState
+from piavatar_envs.config import ClothConfig, ConfigError, EnvConfig, GarmentConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.mpm.types import State
+from piavatar_envs.mpm.types import Model, State
 from piavatar_envs.sim.bodies import Flesh
+from piavatar_envs.sim.prop_geometry import PropPoints
 from piavatar_envs.sim.prop_surface import SolidSurface, deform_prop
 from piavatar_envs.sim.props import PropSet
 from piavatar_envs.sim.shapes import Shapes
@@ -26,6 +44,207 @@ wp.set_module_options({"enable_backward": False})
 
 #: Most vertices of a prop's surface that cloth touches as it is drawn; of a finer one so many remain.
 MOST_PROP_VERTICES = 800
+
+
+def worn_by(config: EnvConfig, flesh: Flesh) -> tuple[GarmentConfig, ...]:
+    """Return the settings of an avatar's garments: its own, or those of the environment."""
+    return config.garments if flesh.avatar.garments is None else flesh.avatar.garments
+
+
+def tailor(config: EnvConfig, flesh: Sequence[Flesh]) -> list[Garment]:
+    """Return the garments of all avatars, cut and draped on their configured shapes.
+
+    Raises:
+        ConfigError: a garment does not fit a body.
+    """
+    garments = []
+    for index, own in enumerate(flesh):
+        for given in worn_by(config, own):
+            wearer = own.asset, own.base_parameters, index, own.shape.randomize
+            try:
+                garments.append(make_garment(given.kind, given.settings, given.cloth, *wearer))
+            except (OSError, TypeError, ValueError) as error:
+                raise ConfigError(f"garments: {error}") from None
+    return garments
+
+
+class Garments:
+    """All garments of a world.
+
+    Attributes:
+        garments: in the order of their avatars.
+        surfaces: skins of all avatars and surfaces of all props.
+        cloth: the garments, simulated.
+    """
+
+    def __init__(
+        self,
+        garments: Sequence[Garment],
+        config: ClothConfig,
+        flesh: Sequence[Flesh],
+        avatars: Sequence[Avatar],
+        props: PropSet,
+        shapes: Shapes,
+        model: Model,
+        state: State,
+    ) -> None:
+        """Allocate the cloth; nothing is placed until the first reset.
+
+        Args:
+            garments: of :func:`tailor`, at least one.
+            config: settings of the solver.
+            flesh: of the world, as all that follows.
+            avatars: likewise.
+            props: likewise.
+            shapes: likewise.
+            model: likewise.
+            state: likewise.
+        """
+        self.garments, self._model, self._state = tuple(garments), model, state
+        bodies = enumerate(zip(flesh, avatars, strict=True))
+        pieces = [avatar_piece(index, *body, shapes, state) for index, body in bodies]
+        pieces += [prop_piece(column, props, state) for column in range(len(props))]
+        self.surfaces = ObstacleSurfaces(pieces, model)
+        self._graded = any(flesh[garment.wearer].shape.randomize for garment in garments)
+        self.cloth = Cloth(
+            garments,
+            self.surfaces.obstacles,
+            model.boundaries,
+            ClothSettings(config.substeps, config.sweeps, wind=config.wind, self_collision=config.self_collision),
+            num_envs=model.num_envs,
+            control_dt=model.control_dt,
+            gravity=tuple(model.step.gravity),
+            device=model.device,
+            rows=model.num_envs if self._graded else 1,
+        )
+        self._worn = [
+            _Worn(garment, flesh[garment.wearer], avatars[garment.wearer], shapes, state) for garment in garments
+        ]
+        self._chosen = wp.zeros(model.num_envs, dtype=int, device=model.device)
+        draped = np.concatenate([garment.draped for garment in garments])
+        edges = self.cloth.mesh.edges
+        span = np.linalg.norm(draped[edges[:, 0]] - draped[edges[:, 1]], axis=1)
+        self._edges = wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=model.device)
+        # length of the pattern over that in the drape
+        self._ease = wp.array((self.cloth.mesh.length / span).astype(np.float32), dtype=float, device=model.device)
+
+    def record_begin(self, graph: LaunchGraph) -> None:
+        """Append the start of a control step: the surfaces as they are before the bodies move."""
+        self.surfaces.record_start(graph)
+
+    def record_end(self, graph: LaunchGraph) -> None:
+        """Append the end of a control step: cloth follows the surfaces, and particles receive its impulses."""
+        self.surfaces.record_end(graph)
+        self.cloth.record_step(graph, self._state.failure)
+        self.surfaces.record_reaction(graph, self._state)
+
+    def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
+        """Append the placement of garments in the masked environments: draped, in the pose of the wearer, at rest.
+
+        Garments on random shapes are graded, their edges by the same ratio as the distances in the drape.
+        """
+        state, n = self.cloth.state, self._model.num_envs
+        graph.launch(lay_down, state.x.shape, [mask], [self._chosen, state])
+        if self._graded:
+            for worn, first in zip(self._worn, self.cloth.first, strict=False):
+                inputs = [self._chosen, worn.surface, worn.motion.shape, int(first)]
+                graph.launch(grade_places, (n, worn.count), inputs, [state.x])
+            inputs = [mask, self._edges, self._ease, state.x]
+            graph.launch(grade_lengths, self.cloth.length.shape, inputs, [self.cloth.length])
+        for worn, first in zip(self._worn, self.cloth.first, strict=False):
+            given = worn.surface, worn.motion, worn.workspace, state.x, int(first)
+            record_skin(graph, self._chosen, *given)
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Return the arrays of a checkpoint by name."""
+        found = {f"cloth.{name}": array for name, array in self.cloth.arrays().items()}
+        return found | ({"cloth.length": self.cloth.length} if self._graded else {})
+
+
+class _Worn:
+    """A garment as its wearer's bones place it at a reset.
+
+    Attributes:
+        count: number of vertices.
+        surface: its drape where shapes are fixed; else that of the mean shape, and its changes with the shape.
+        motion: pose of the last reset, and the shape.
+        workspace: of :func:`~piavatar_envs.avatar.skin.record_skin`.
+    """
+
+    def __init__(self, garment: Garment, flesh: Flesh, avatar: Avatar, shapes: Shapes, state: State) -> None:
+        device, rest, deltas, shape = avatar.model.device, garment.draped, None, None
+        if flesh.shape.randomize:
+            deltas, shape = garment.shape_deltas, shapes.parameters(garment.wearer)
+            given = flesh.base_parameters[:, None]
+            halves = np.concatenate([np.maximum(-given, 0.0), np.maximum(given, 0.0)], axis=1)
+            rest = rest - np.tensordot(halves.ravel(), deltas, axes=1)
+        self.count = len(rest)
+        self.surface = bone_surface(rest, garment.skin_joints, garment.skin_weights, device, deltas)
+        self.motion = motion_of(avatar, state.x, avatar.placed, shape)
+        self.workspace = skin_workspace(self.surface, avatar.model.num_envs, device)
+
+
+def bytes_of_garments(garments: Sequence[Garment], flesh: Sequence[Flesh], points: Sequence[PropPoints]) -> int:
+    """Estimate the memory of the garments of an environment and of what they touch [bytes]; 0 without garments.
+
+    Args:
+        garments: of the world.
+        flesh: of all avatars.
+        points: of all props.
+    """
+    if not garments:
+        return 0
+    surface = len(flesh) * PROXY_VERTICES + sum(min(len(own.vertices), MOST_PROP_VERTICES) for own in points)
+    skins = sum(skin_bytes(len(own.points.rest[0])) for own in flesh) + len(garments) * skin_bytes(0)
+    slots = 2 if len(flesh) + len(points) > 1 else 1
+    return bytes_of_obstacles(surface) + skins + sum(bytes_of_cloth(own.mesh, slots) for own in garments)
+
+
+@wp.kernel
+def lay_down(
+    mask: wp.array(dtype=wp.bool),
+    # out
+    chosen: wp.array(dtype=int),
+    state: ClothState,
+):
+    """Choose the masked environments, others are -1, and stop their cloth; over ``(num_envs, V)``."""
+    e, i = wp.tid()
+    if i == 0:
+        chosen[e] = wp.where(mask[e], e, -1)
+    if mask[e]:
+        state.v[e, i] = wp.vec3(0.0)
+        for slot in range(2):
+            state.near[e, i, slot] = -1
+
+
+@wp.kernel
+def grade_places(
+    chosen: wp.array(dtype=int),
+    surface: SkinSurface,
+    shape: wp.array2d(dtype=float),
+    first: int,
+    # out
+    x: wp.array2d(dtype=wp.vec3),
+):
+    """Write a garment in the rest pose of chosen environments' shapes, from ``first`` on; over ``(num_envs, V)``."""
+    e, i = wp.tid()
+    if chosen[e] >= 0:
+        x[e, first + i] = with_shape(surface, shape, e, i)
+
+
+@wp.kernel
+def grade_lengths(
+    mask: wp.array(dtype=wp.bool),
+    edges: wp.array(dtype=wp.vec2i),
+    ease: wp.array(dtype=float),
+    x: wp.array2d(dtype=wp.vec3),
+    # out
+    length: wp.array2d(dtype=float),
+):
+    """Set the rest lengths of the masked environments' edges, ``ease`` times those in ``x``; over ``(num_envs, M)``."""
+    e, k = wp.tid()
+    if mask[e]:
+        length[e, k] = ease[k] * wp.length(x[e, edges[k][0]] - x[e, edges[k][1]])
 
 
 def avatar_piece(index: int, flesh: Flesh, avatar: Avatar, shapes: Shapes, state: State) -> Piece:
@@ -65,6 +284,11 @@ def prop_piece(column: int, props: PropSet, state: State) -> Piece:
 
     weights = _placed(solid.weights(), prop.first, model.num_particles)
     return Piece(vertices, faces, np.full(len(vertices), ALL_PARTS), weights, record)
+
+
+def bytes_of_cloth(mesh: ClothMesh, slots: int) -> int:
+    """Return the memory of a garment in an environment, with ``slots`` contacts a vertex [bytes]."""
+    return mesh.num_vertices * (5 * 12 + 3 * 4 + slots * (5 * 12 + 3 * 4)) + 8 * mesh.num_edges
 
 
 def _placed(weights: sparse.csr_array, first: int, num_particles: int) -> sparse.csr_array:

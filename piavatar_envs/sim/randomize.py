@@ -8,7 +8,9 @@ depend on it, each from its nominal value, so that none of them drifts:
   in body weights), strength and springs of its joints under torque control (a heavier body is a stronger one), and the
   reference density of its velocity fields;
 - *stiffness*: the moduli of its flesh, and with them its viscosity;
-- *ground friction*: coefficients on the ground, walls and colliders; *body friction*: those between bodies.
+- *ground friction*: coefficients on the ground, walls and colliders; *body friction*: those between bodies;
+- *cloth mass*: the mass per area of all garments; *cloth stiffness*: their stretch and bending stiffness; *cloth
+  friction*: their friction.
 
 Only constants that vary get a row for each environment. The time step is that of the stiffest and lightest body that
 can be drawn (:func:`fastest_wave`), not of a sample, since otherwise an environment of a batch would differ from the
@@ -26,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.avatar import Avatar
+from piavatar_envs.cloth.types import Fabrics
 from piavatar_envs.config.schema import UNCHANGED, RandomizeConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.rng import STREAM_PARAMETERS, generator
@@ -68,6 +71,12 @@ OF_WORLD = {
     "body_friction_factor": "friction between bodies",
 }
 OF_AVATAR = {"mass_factor": "density", "stiffness_factor": "Young's modulus"}
+#: Factors of all garments, in the order of the columns, which are the last: what each multiplies, and its description.
+OF_CLOTH = {
+    "cloth_mass_factor": (("areal_density",), "mass of garments"),
+    "cloth_stiffness_factor": (("stretch", "bending"), "stretch and bending stiffness of garments"),
+    "cloth_friction_factor": (("friction",), "friction of garments"),
+}
 
 
 def fastest_wave(config: RandomizeConfig, flesh: Iterable[MaterialPoints]) -> float:
@@ -116,7 +125,8 @@ class Randomization:
     Attributes:
         config: ranges of the factors.
         model, avatars: the world, whose randomised constants get rows of their own.
-        factors: shape ``(num_envs, factors)``, 1 until a reset; the world's, then those of each avatar.
+        factors: shape ``(num_envs, factors)``, 1 until a reset; the world's, then those of each avatar, then those of
+            garments, if there are any whose fabrics vary.
     """
 
     config: RandomizeConfig
@@ -125,11 +135,9 @@ class Randomization:
     factors: wp.array = field(init=False)
 
     def __post_init__(self) -> None:
-        n, device, count = self.model.num_envs, self.model.device, len(self.avatars)
-        names = [*OF_WORLD, *(list(OF_AVATAR) * count)]
-        bounds = [getattr(self.config, name) for name in names]
-        self.factors = wp.array(np.ones((n, len(names)), np.float32), dtype=float, device=device)
-        self._bounds = wp.array(np.array(bounds, np.float32), dtype=wp.vec2, device=device)
+        count = len(self.avatars)
+        self._allocate([*OF_WORLD, *(list(OF_AVATAR) * count)])
+        self._scales_cloth = False
         self._kept: dict[str, wp.array] = {}
         self._scaled: list[_Scaled] = []
         self._bodies: dict[int, _Body] = {}
@@ -146,6 +154,24 @@ class Randomization:
                 for name in ("mu", "lam"):
                     self._scale(column + 1, self.model.particles, name, f"matter.{name}", own)
 
+    def _allocate(self, names: Sequence[str]) -> None:
+        """Allocate the factors of some settings."""
+        n, device = self.model.num_envs, self.model.device
+        bounds = [getattr(self.config, name) for name in names]
+        self.factors = wp.array(np.ones((n, len(names)), np.float32), dtype=float, device=device)
+        self._bounds = wp.array(np.array(bounds, np.float32), dtype=wp.vec2, device=device)
+
+    def scale_cloth(self, fabric: Fabrics) -> None:
+        """Let factors multiply the properties of all garments; to be called before a launch binds them."""
+        if not any(self._varies(name) for name in OF_CLOTH):
+            return
+        self._scales_cloth = True
+        first = self.factors.shape[1]
+        self._allocate([*OF_WORLD, *(list(OF_AVATAR) * len(self.avatars)), *OF_CLOTH])
+        for index, (setting, (names, _)) in enumerate(OF_CLOTH.items()):
+            for name in names if self._varies(setting) else ():
+                self._scale(first + index, fabric, name, f"cloth.{name}")
+
     def _varies(self, name: str) -> bool:
         """Return whether the range of a factor is more than 1."""
         return getattr(self.config, name) != UNCHANGED
@@ -158,14 +184,21 @@ class Randomization:
                 for name, what in names.items()
                 if self._varies(name)
             )
-            for names in (OF_WORLD, OF_AVATAR)
+            for names in (OF_WORLD | self._of_cloth, OF_AVATAR)
         ]
         return found[0], found[1]
+
+    @property
+    def _of_cloth(self) -> dict[str, str]:
+        """Return the descriptions of the factors on garments, if there are any."""
+        return {name: what for name, (_, what) in OF_CLOTH.items()} if self._scales_cloth else {}
 
     def column(self, name: str, avatar: int = 0) -> wp.array:
         """Return the factor of the setting ``name`` in every environment, shape ``(num_envs,)``."""
         if name in OF_WORLD:
             return self.factors[:, list(OF_WORLD).index(name)]
+        if name in OF_CLOTH:
+            return self.factors[:, list(OF_CLOTH).index(name) - len(OF_CLOTH) + self.factors.shape[1]]
         return self.factors[:, len(OF_WORLD) + avatar * len(OF_AVATAR) + list(OF_AVATAR).index(name)]
 
     def _scale(self, factor: int, holder: Any, name: str, key: str, part: slice = slice(None)) -> wp.array:

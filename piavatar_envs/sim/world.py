@@ -29,6 +29,7 @@ from piavatar_envs.mpm.types import Model, Scratch, State
 from piavatar_envs.sim.bodies import Flesh, load_avatar, pose_control
 from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_places
 from piavatar_envs.sim.forces import Forces, Receivers
+from piavatar_envs.sim.garments import Garments, bytes_of_garments, tailor, worn_by
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
 from piavatar_envs.sim.randomize import Randomization, fastest_wave, limiting_wave
 from piavatar_envs.sim.resolution import GRID_PER_HEIGHT, check_sizes
@@ -56,6 +57,7 @@ class Simulation:
         props: the soft props.
         randomization: factors on mass, stiffness and friction, and the constants that they scale.
         shapes: bodies of random shape.
+        garments: what the avatars wear; None without garments.
         receivers: what external forces can act on.
         forces: external forces; None before :meth:`enable_forces`.
         initial_colliders: poses and velocities of the colliders after a reset.
@@ -102,6 +104,7 @@ class Simulation:
         self.randomization = Randomization(config.randomize, self.model, self.avatars)
         self.shapes = Shapes(self.flesh, self.avatars, self.model, self.randomization)
         self._build_props()
+        self.garments = self._dress()
         self.receivers = Receivers(self.avatars, self.controllers, self.props)
         self.forces: Forces | None = None
 
@@ -126,6 +129,7 @@ class Simulation:
             for avatar, asset in zip(self._avatar_configs, self._assets, strict=True)
         ]
         check_shape_names(self.flesh)
+        self._tailored = tailor(self.config, self.flesh) if any(worn_by(self.config, own) for own in self.flesh) else []
         self._torque = [flesh.torque_control() for flesh in self.flesh]
         self._solids = [prop_points(prop, spacing) for prop in self.scene.props]
         self._prop_matter = [
@@ -188,6 +192,7 @@ class Simulation:
             rest=rest,
             sound_speed=wave,
             limiting_speed=limiting,
+            more_bytes=bytes_of_garments(self._tailored, self.flesh, self._solids),
         )
         fields = self.model.contact.num_fields
         self.initial_colliders = make_boundaries(subjects.colliders, fields, self.num_envs, self.device)
@@ -214,6 +219,15 @@ class Simulation:
         first = self.subjects.first[count:-1]
         self.props = PropSet(self.scene.props, self._solids, self._prop_matter, first, columns, self.model)
 
+    def _dress(self) -> Garments | None:
+        """Allocate the garments, whose fabrics vary as the settings say."""
+        if not self._tailored:
+            return None
+        of_world = self.flesh, self.avatars, self.props, self.shapes, self.model, self.state
+        garments = Garments(self._tailored, self.config.cloth, *of_world)
+        self.randomization.scale_cloth(garments.cloth.fabric)
+        return garments
+
     def record_randomization(self, graph: LaunchGraph, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
         """Record the launches by which the masked environments draw bodies, then factors on their constants."""
         self.shapes.record_reset(graph, mask, seed, episode)
@@ -231,6 +245,8 @@ class Simulation:
             graph.launch(place_colliders, boundaries.position.shape, [mask, self.initial_colliders], [boundaries])
         graph.parallel_for_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
         self.props.record_tracking(graph, self.state)
+        if self.garments:
+            self.garments.record_reset(graph, mask)
 
     def enable_forces(self) -> Forces:
         """Return the external forces, which control steps that are recorded from now on apply."""
@@ -240,7 +256,7 @@ class Simulation:
     def record_step(self, graph: LaunchGraph) -> None:
         """Append a control step towards the avatars' goals; see :func:`record_control_step`."""
         simulated = self.avatars, self.controllers, self.model, self.state, self.scratch
-        record_control_step(graph, *simulated, self.props, self.forces)
+        record_control_step(graph, *simulated, self.props, self.forces, self.garments)
 
     def arrays(self) -> dict[str, wp.array]:
         """Return all arrays of a checkpoint by name."""
@@ -254,6 +270,7 @@ class Simulation:
         found |= self.shapes.arrays() | self.randomization.arrays()
         sensors = ("boundary_impulse", "boundary_moment", "pair_impulse", "part_impulse", "penetration")
         found |= {f"sensors.{name}": getattr(self.sensors, name) for name in sensors}
+        found |= self.garments.arrays() if self.garments else {}
         return found | self.props.arrays() | (self.forces.arrays() if self.forces else {})
 
 
@@ -266,12 +283,15 @@ def record_control_step(
     scratch: Scratch,
     props: PropSet | None = None,
     forces: Forces | None = None,
+    garments: Garments | None = None,
 ) -> None:
     """Append one control step, after which avatars and props are tracked.
 
-    Controllers of different avatars run in parallel: none reads what another one writes.
+    Controllers of different avatars run in parallel: none reads what another one writes. Cloth follows all of them.
     """
     simulated = (model, state, scratch)
+    if garments:
+        garments.record_begin(graph)
     begins = graph.branches(controllers, lambda controller, own: controller.record_begin(own))
     record_begin(graph, *simulated, branches=begins)  # activates blocks
     if forces:
@@ -298,6 +318,8 @@ def record_control_step(
         graph.parallel(*ends)
     if props:
         props.record_tracking(graph, state)
+    if garments:
+        garments.record_end(graph)
     if forces:
         forces.record_end(graph, state)
 
