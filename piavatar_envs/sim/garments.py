@@ -29,7 +29,6 @@ from piavatar_envs.cloth.obstacles import ObstacleSurfaces, Piece, bytes_of_obst
 from piavatar_envs.cloth.proxy import ALL_PARTS, PROXY_VERTICES, proxy_of
 from piavatar_envs.cloth.remesh import remesh
 from piavatar_envs.cloth.solver import Cloth
-from piavatar_envs.cloth.tailor import make_garment
 from piavatar_envs.cloth.types import ClothSettings, ClothState
 from piavatar_envs.config import ClothConfig, ConfigError, EnvConfig, GarmentConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -57,6 +56,8 @@ def tailor(config: EnvConfig, flesh: Sequence[Flesh]) -> list[Garment]:
     Raises:
         ConfigError: a garment does not fit a body.
     """
+    from piavatar_envs.cloth.tailor import make_garment  # not needed in a world without garments
+
     garments = []
     for index, own in enumerate(flesh):
         for given in worn_by(config, own):
