@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.garments.sheets import LINEN, Run, flat_sheet, garment, hanging_sheet, move, sphere, surfaces
 from piavatar_envs.mpm.colliders import Collider, make_boundaries
 from piavatar_envs.mpm.types import FAILURE_CLOTH
-from tests.cloth.sheets import LINEN, Run, flat_sheet, garment, hanging_sheet, move, sphere, surfaces
 from tests.gpu_on_cpu import gpu_on_cpu
 
 #: Places of the balls that sheets fall on, one an environment [m].

@@ -7,9 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.garments.sheets import (
+    LINEN,
+    Run,
+    booked,
+    flat_sheet,
+    garment,
+    hanging_sheet,
+    move,
+    plane,
+    sphere,
+    surfaces,
+)
 from piavatar_envs.cloth.obstacles import QUANTUM
 from piavatar_envs.mpm.colliders import Collider, make_boundaries
-from tests.cloth.sheets import LINEN, Run, booked, flat_sheet, garment, hanging_sheet, move, plane, sphere, surfaces
 
 G = 9.81
 NOWHERE = (0.0, 0.0, 0.0)

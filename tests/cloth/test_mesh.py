@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from benchmarks.garments.sheets import lattice, mesh_of
 from piavatar_envs.cloth.mesh import ClothMesh, joined
-from tests.cloth.sheets import lattice, mesh_of
 
 
 def bending(mesh: ClothMesh) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Sheets of cloth and surfaces of obstacles for tests of the solver, without a body."""
+"""Sheets of cloth and surfaces of obstacles, without a body."""
 
 from __future__ import annotations
 
