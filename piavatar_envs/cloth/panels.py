@@ -23,6 +23,9 @@ from piavatar_envs.cloth.wearer import Wearer
 
 #: Ways outwards [m], shape ``(W, 3)``, of a piece's points with normals, and its shares of the wearer's vertices.
 Ease = Callable[[Wearer, sparse.csr_array, np.ndarray, np.ndarray], np.ndarray]
+#: Base of the neck below its joint, over the way to that of the chest, slope of its plane, lower in front, and width of
+#: a neckline over that of the shoulders' joints.
+_COLLAR, _TILT, _WIDTH = 0.12, 0.45, 0.5
 #: Shares of a smoothing pass and of the one back, which keeps the size.
 _SHARES = 0.63, -0.65
 #: Passes along the coarse mesh, which make its edges even.
@@ -132,18 +135,22 @@ def limb_field(wearer: Wearer, along: np.ndarray, end: float, first: str, second
     return np.where(np.isfinite(along), (end - along) * size, 1.0)
 
 
-def below_neck(wearer: Wearer, depth: float, tilt: float) -> np.ndarray:
-    """Return the distance of each vertex below a neckline [m], shape ``(V,)``.
+def below_neck(wearer: Wearer, depth: float) -> np.ndarray:
+    """Return the distance of each vertex from a round neckline [m], positive outside of it, shape ``(V,)``.
 
     Args:
         wearer: the body.
-        depth: of the neckline below the joint of the neck, over the way from there to the joint of the chest.
-        tilt: slope of its plane, lower in front.
+        depth: of the neckline in front, below the base of the neck, over the way from there to the joint of the chest;
+            half of it at the back.
     """
-    neck = wearer.at("neck")
-    down = np.array([0.0, tilt, -1.0]) / np.hypot(tilt, 1.0)
-    start = neck - [0.0, 0.0, depth * (neck[2] - wearer.at("spine3")[2])]
-    field = (wearer.vertices - start) @ down
+    neck, unit = wearer.at("neck"), wearer.at("neck")[2] - wearer.at("spine3")[2]
+    down = np.array([0.0, _TILT, -1.0]) / np.hypot(_TILT, 1.0)
+    from_neck = wearer.vertices - neck
+    low = from_neck @ down - _COLLAR * unit
+    wide = _WIDTH * wearer.at("left_shoulder")[0] - wearer.at("right_shoulder")[0] * _WIDTH
+    deep = np.maximum(depth - _COLLAR, 1.0e-3) * unit * np.where(from_neck[:, 1] < 0.0, 1.0, 0.5)
+    scoop = np.hypot(from_neck[:, 0] / (0.5 * wide), np.maximum(low, 0.0) / deep) - 1.0
+    field = np.where(low > 0.0, np.minimum(low, scoop * np.minimum(0.5 * wide, deep)), low)
     return np.where(wearer.turned_by("head") > 0.5, -1.0, field)
 
 

@@ -21,7 +21,7 @@ ROW = np.sqrt(0.75)
 STEEPEST = 0.5
 #: Outward share of the folds that a wider panel starts with, and their number around the body.
 _FOLD, _FOLDS = 0.12, 9
-_SAMPLES, _SMOOTHING = 256, 5.0
+_SAMPLES, _SMOOTHING = 1024, 20.0
 
 
 class Belt:
@@ -61,6 +61,11 @@ class Belt:
         x, y = (np.interp(angle % (2.0 * np.pi), self._angle, self._curve[:, axis]) for axis in range(2))
         return np.stack([x, y, np.full(len(angle), self.height)], axis=1)
 
+    def angle(self, points: np.ndarray) -> np.ndarray:
+        """Return the angles of the nearest points of the curve, shape ``(N,)``."""
+        apart = np.linalg.norm(points[:, None, :2] - self._curve[None, :-1], axis=2)
+        return self._angle[apart.argmin(axis=1)]
+
 
 @dataclass(frozen=True, eq=False)
 class Sector:
@@ -81,35 +86,43 @@ class Sector:
     rows: tuple[np.ndarray, ...]
 
     @staticmethod
-    def around(girth: float, length: float, flare: float, edge: float, first: np.ndarray | None = None) -> Sector:
-        """Return a closed panel.
+    def around(
+        girth: float,
+        length: float,
+        flare: float,
+        edge: float,
+        first: np.ndarray | None = None,
+        span: tuple[float, float] | None = None,
+    ) -> Sector:
+        """Return a panel.
 
         Args:
-            girth: length of its inner arc [m].
+            girth: length of its inner arc over a full turn [m].
             length: from the inner to the outer arc [m].
             flare: angle over a full turn: 1 is a full circle.
             edge: length of its edges, about [m].
             first: ascending angles of the inner ring; by default as many as the edges' length wants.
+            span: angles at which it begins and ends, ascending; None for a closed one.
         """
         radius = girth / (2.0 * np.pi * flare)
-        count = max(1, round(length / (edge * ROW)))
-        polar, rows, start = [], [], 0
-        for index, at in enumerate(radius + np.linspace(0.0, length, count + 1)):
-            around = max(8, round(2.0 * np.pi * flare * at / edge))
-            angle = 2.0 * np.pi * (np.arange(around) + 0.5 * (index % 2)) / around
-            if index == 0 and first is not None:
-                angle = first
+        start, end = span or (0.0, 2.0 * np.pi)
+        polar, rows = [], []
+        for index, at in enumerate(np.linspace(radius, radius + length, max(1, round(length / (edge * ROW))) + 1)):
+            count = max(8, round((end - start) * flare * at / edge))
+            steps = np.arange(count) + 0.5 * (index % 2)
+            if span is not None:
+                steps = np.concatenate([[0.0], steps[steps > 0.0], [count]])
+            angle = first if index == 0 and first is not None else start + (end - start) * steps / count
+            rows.append(sum(map(len, rows)) + np.arange(len(angle)))
             polar.append(np.stack([np.full(len(angle), at), angle], axis=1))
-            rows.append(start + np.arange(len(angle)))
-            start += len(angle)
         polar = np.concatenate(polar)
-        faces = np.concatenate([ring(a, b, polar[:, 1]) for a, b in pairwise(rows)])
-        return Sector(radius, flare, polar, faces, tuple(rows))
+        faces = [between(upper, lower, polar[:, 1], span is None) for upper, lower in pairwise(rows)]
+        return Sector(radius, flare, polar, np.concatenate(faces), tuple(rows))
 
     def lengths(self, pairs: np.ndarray) -> np.ndarray:
         """Return distances of pairs of vertices ``(K, 2)`` in the flat pattern [m]."""
         first, second = self.polar[pairs[:, 0]], self.polar[pairs[:, 1]]
-        turn = self.flare * ((first[:, 1] - second[:, 1] + np.pi) % (2.0 * np.pi) - np.pi)
+        turn = self.flare * ((first[:, 1] - second[:, 1] + np.pi) % (2.0 * np.pi) - np.pi)  # over the seam, if closed
         square = first[:, 0] ** 2 + second[:, 0] ** 2 - 2.0 * first[:, 0] * second[:, 0] * np.cos(turn)
         return np.sqrt(np.maximum(square, 0.0))
 
@@ -129,23 +142,26 @@ class Sector:
         return belt.at(angle) + ruling
 
 
-def ring(upper: np.ndarray, lower: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return the triangles between two closed rows of vertices whose angles ascend, shape ``(T, 3)`` int32.
+def between(upper: np.ndarray, lower: np.ndarray, angle: np.ndarray, closed: bool = True) -> np.ndarray:
+    """Return the triangles between two rows of vertices whose angles ascend, shape ``(T, 3)`` int32.
 
     Args:
         upper: vertices of the one row.
         lower: those of the row below it.
-        angle: of all vertices; outsides face away from the axis that it turns about.
+        angle: of all vertices, or another measure along the rows; outsides face away from the axis that it turns about.
+        closed: whether the rows are closed after a full turn.
     """
+    tops, bottoms = (row.tolist() + ([row[0]] if closed else []) for row in (upper, lower))
+    above, below = angle[tops].copy(), angle[bottoms].copy()
+    if closed:
+        above[-1] += 2.0 * np.pi
+        below[-1] += 2.0 * np.pi
     faces, i, k = [], 0, 0
-    while i < len(upper) or k < len(lower):
-        above = angle[upper[(i + 1) % len(upper)]] + 2.0 * np.pi * ((i + 1) // len(upper))
-        below = angle[lower[(k + 1) % len(lower)]] + 2.0 * np.pi * ((k + 1) // len(lower))
-        here = upper[i % len(upper)], lower[k % len(lower)]
-        if k == len(lower) or (i < len(upper) and above <= below):
-            faces.append((*here, upper[(i + 1) % len(upper)]))
+    while i < len(tops) - 1 or k < len(bottoms) - 1:
+        if k == len(bottoms) - 1 or (i < len(tops) - 1 and above[i + 1] <= below[k + 1]):
+            faces.append((tops[i], bottoms[k], tops[i + 1]))
             i += 1
         else:
-            faces.append((*here, lower[(k + 1) % len(lower)]))
+            faces.append((tops[i], bottoms[k], bottoms[k + 1]))
             k += 1
     return np.array(faces, np.int32)

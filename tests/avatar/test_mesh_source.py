@@ -124,6 +124,6 @@ def test_a_skeleton_is_in_the_coordinates_of_the_file(person, file, read, tmp_pa
 def test_a_quantised_glb_without_its_skin_is_a_surface(tmp_path):
     rig = rig_of(load_asset(), named("mixamo"), storage="quantized", material={"name": "skin"})
     path = rig.write().save(tmp_path / "a.glb")
-    vertices, faces, colors, textures = mesh._load(path)
+    vertices, faces, colors, textures = mesh.load_surface(path)
     assert np.ptp(vertices[:, 1]) == pytest.approx(np.ptp(rig.vertices[:, 2]), abs=1e-4)
     assert len(faces) == len(rig.faces) and (colors == 255).all() and textures is None

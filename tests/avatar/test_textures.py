@@ -168,7 +168,7 @@ def test_an_obj_file_has_the_images_of_its_materials(tmp_path):
     pixels = np.zeros((4, 4, 3), np.uint8)
     pixels[:2, :2] = (0, 255, 0)  # upper left
     write_obj(tmp_path, pixels)
-    loaded = mesh._load(tmp_path / "square.obj")
+    loaded = mesh.load_surface(tmp_path / "square.obj")
     (texture,) = loaded.textures.images
     assert np.array_equal(texture.pixels, pixels)
     on_image = loaded.textures.image == 0
@@ -189,6 +189,6 @@ def test_an_obj_file_reads_nothing_outside_of_its_folder(tmp_path):
     write_obj(inner, checker(2))
     write_obj(tmp_path, checker(2))
     (inner / "square.mtl").write_text("newmtl cloth\nmap_Kd ../skin.png\n")
-    assert mesh._load(inner / "square.obj").textures is None
+    assert mesh.load_surface(inner / "square.obj").textures is None
     (inner / "square.mtl").unlink()
-    assert mesh._load(inner / "square.obj").textures is None
+    assert mesh.load_surface(inner / "square.obj").textures is None

@@ -61,7 +61,7 @@ def build(path: str, height: float | None = None, up: str | None = None, skeleto
 def read_character(path: str, height: float | None = None, up: str | None = None) -> Character:
     """Return the surface with joints and weights of the registered body; arguments and errors as for :func:`build`."""
     name = Path(path).name
-    vertices, faces, colors, textures = _load(Path(path))
+    vertices, faces, colors, textures = load_surface(Path(path))
     if up not in (None, "y", "z"):
         raise ValueError(f"up={up!r} is no axis that points up; use y or z")
     found = []
@@ -106,7 +106,7 @@ class _Loaded(NamedTuple):
     textures: Textures | None
 
 
-def _load(path: Path) -> _Loaded:
+def load_surface(path: Path) -> _Loaded:
     """Return the surface of a file."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(FORMATS)}")
