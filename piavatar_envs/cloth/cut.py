@@ -26,7 +26,6 @@ class Cut:
             ``positions``.
         fit: positions of the same vertices on another shape of the same body; None binds them to the nearest skin.
         thickness: distance at which it lies on the skin [m].
-        draw_out: time in which held vertices are brought to their places in the drape, 0 where they are there [s].
     """
 
     positions: np.ndarray
@@ -36,7 +35,6 @@ class Cut:
     lengths: Callable[[np.ndarray], np.ndarray] | None = None
     fit: Callable[[Wearer], np.ndarray] | None = None
     thickness: float = THICKNESS
-    draw_out: float = 0.0
 
     def measure(self, pairs: np.ndarray) -> np.ndarray:
         """Return rest lengths of pairs of vertices ``(K, 2)`` [m]."""

@@ -117,7 +117,7 @@ class ObstacleSurfaces:
         """
         self.pieces, self._model = tuple(pieces), model
         self._first = np.cumsum([0, *(len(piece.points) for piece in pieces)])
-        self.obstacles = self._allocate()
+        self.obstacles = allocate(self.pieces, model.num_envs, model.device)
         self._receivers = self._connect()
 
     def record_start(self, graph: LaunchGraph) -> None:
@@ -140,33 +140,6 @@ class ObstacleSurfaces:
         graph.parallel_for_each(pieces, lambda own, branch: own[0].record(branch, points, int(own[1])))
         graph.launch(find_normals, points.shape, [self.obstacles, points], [normals])
 
-    def _allocate(self) -> Obstacles:
-        n, device, count = self._model.num_envs, self._model.device, int(self._first[-1])
-        faces = np.concatenate([piece.faces + first for piece, first in zip(self.pieces, self._first, strict=False)])
-        half = np.concatenate([faces[:, [a, b]] for a in range(3) for b in range(3) if a != b])
-        ring_start, ring = _lists(np.unique(half, axis=0), count)
-        corners = np.stack([faces.ravel(), np.repeat(np.arange(len(faces)), 3)], axis=1)
-        fan_start, fan = _lists(corners, count)
-        posts = [spread(piece.points) + first for piece, first in zip(self.pieces, self._first, strict=False)]
-        lists = {
-            "ring_start": ring_start,
-            "ring": ring,
-            "fan_start": fan_start,
-            "fan": fan,
-            "part": np.concatenate([piece.part for piece in self.pieces]),
-            "piece_start": self._first,
-            "post_start": np.cumsum([0, *map(len, posts)]),
-            "post": np.concatenate(posts),
-        }
-        vectors = ("start", "end", "start_normal", "end_normal")
-        return fill(
-            Obstacles(),
-            faces=wp.array(faces.astype(np.int32), dtype=wp.vec3i, device=device),
-            impulse=wp.zeros((n, count, 6), dtype=wp.int64, device=device),
-            **{name: _integers(values, device) for name, values in lists.items()},
-            **{name: wp.zeros((n, count), dtype=wp.vec3, device=device) for name in vectors},
-        )
-
     def _connect(self) -> Receivers:
         n, device = self._model.num_envs, self._model.device
         weights = sparse.csr_array(sparse.vstack([piece.weights for piece in self.pieces]))
@@ -187,6 +160,36 @@ class ObstacleSurfaces:
             force=wp.zeros((n, weights.shape[0]), dtype=wp.vec3, device=device),
             couple=wp.zeros((n, weights.shape[0]), dtype=wp.vec3, device=device),
         )
+
+
+def allocate(pieces: Sequence[Piece], num_envs: int, device: str) -> Obstacles:
+    """Return the surfaces of pieces on a device, all of whose points and normals are zero."""
+    start = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    count = int(start[-1])
+    faces = np.concatenate([piece.faces + first for piece, first in zip(pieces, start, strict=False)])
+    half = np.concatenate([faces[:, [a, b]] for a in range(3) for b in range(3) if a != b])
+    ring_start, ring = _lists(np.unique(half, axis=0), count)
+    corners = np.stack([faces.ravel(), np.repeat(np.arange(len(faces)), 3)], axis=1)
+    fan_start, fan = _lists(corners, count)
+    posts = [spread(piece.points) + first for piece, first in zip(pieces, start, strict=False)]
+    lists = {
+        "ring_start": ring_start,
+        "ring": ring,
+        "fan_start": fan_start,
+        "fan": fan,
+        "part": np.concatenate([piece.part for piece in pieces]),
+        "piece_start": start,
+        "post_start": np.cumsum([0, *map(len, posts)]),
+        "post": np.concatenate(posts),
+    }
+    vectors = ("start", "end", "start_normal", "end_normal")
+    return fill(
+        Obstacles(),
+        faces=wp.array(faces.astype(np.int32), dtype=wp.vec3i, device=device),
+        impulse=wp.zeros((num_envs, count, 6), dtype=wp.int64, device=device),
+        **{name: _integers(values, device) for name, values in lists.items()},
+        **{name: wp.zeros((num_envs, count), dtype=wp.vec3, device=device) for name in vectors},
+    )
 
 
 def bytes_of_obstacles(points: int) -> int:

@@ -18,8 +18,8 @@ from piavatar_envs.cloth.wearer import Wearer
 _EASE, THICKNESS = 0.012, 0.006
 #: Length of a scarf without one over the wearer's height, and half the length that is held at the nape [m].
 _LENGTH, _HELD = 0.95, 0.045
-#: Place of its middle line beside the neck over that of the shoulder's joint, way from the neck to where it falls freely
-#: and width of what is measured, both over the wearer's height, and shift outwards over its width.
+#: Place of its middle line beside the neck over that of the shoulder's joint; way from the neck to where it falls, and
+#: width of what is measured, both over the wearer's height; and shift outwards over its width.
 _BESIDE, _CHEST, _NEAR, _SHIFT = 0.5, 0.09, 0.02, 0.1
 _SAMPLES = 600
 
