@@ -30,6 +30,8 @@ _COLLAR, _TILT, _WIDTH = 0.12, 0.45, 0.5
 _SHARES = 0.63, -0.65
 #: Passes along the coarse mesh, which make its edges even.
 _EVENING = 12
+#: Shortest edge that stays, over the wanted length.
+_SHORTEST = 0.6
 #: Turns of edges in which a mesh is made of better triangles, over the number of its edges.
 _MOST_FLIPS = 10
 
@@ -87,8 +89,12 @@ def lay_out(wearer: Wearer, field: np.ndarray, ease: Ease, gap: float, edge: flo
     area = 0.5 * np.linalg.norm(np.cross(*_sides(points, rows)), axis=1).sum()
     count = max(int(area / (ROW * edge**2)), 12)
     found = remesh(points, rows, min(count, len(used)), first=boundary_loops(rows), spacing=edge)
-    panel = Panel(blend, rows, rim, found.keep, found.faces)
-    return replace(panel, faces=flipped(laid(wearer, panel, ease, gap, smoothing), panel.faces))
+    faces = _without_notches(found.faces, rim[found.keep])
+    panel = Panel(blend, rows, rim, found.keep, flipped(points[found.keep], faces))
+    placed = laid(wearer, panel, ease, gap, smoothing)
+    there, faces = without_short(placed, panel.faces, _SHORTEST * edge)
+    panel = replace(panel, keep=panel.keep[there], faces=faces)
+    return replace(panel, faces=flipped(laid(wearer, panel, ease, gap, smoothing), faces))
 
 
 def laid(wearer: Wearer, panel: Panel, ease: Ease, gap: float, smoothing: int) -> np.ndarray:
@@ -98,8 +104,6 @@ def laid(wearer: Wearer, panel: Panel, ease: Ease, gap: float, smoothing: int) -
     for loop in boundary_loops(panel.faces):
         border[loop] = True
     mean = _means(panel.faces, border)
-    inner = border & ~panel.rim[panel.keep]  # of the piece, but on the border of the garment: a notch
-    points[inner] = (mean @ points)[inner]
     for _ in range(_EVENING):
         way, normals = mean @ points - points, vertex_normals(points, panel.faces)
         points = points + 0.5 * (way - np.einsum("nd,nd->n", way, normals)[:, None] * normals)
@@ -184,6 +188,55 @@ def _means(faces: np.ndarray, rim: np.ndarray) -> sparse.csr_array:
     inner = sparse.diags_array((~rim).astype(np.float64)) @ near
     both = (inner + sparse.diags_array(rim.astype(np.float64)) @ border).tocsr()
     return sparse.diags_array(1.0 / np.maximum(both.sum(axis=1), 1.0)) @ both
+
+
+def _without_notches(faces: np.ndarray, rim: np.ndarray) -> np.ndarray:
+    """Return the triangles of a mesh, and one more where a vertex within it came to lie on its border."""
+    more = []
+    for loop in boundary_loops(faces):
+        for before, at, after in zip(np.roll(loop, 1), loop, np.roll(loop, -1), strict=True):
+            if not rim[at] and rim[before] and rim[after]:
+                more.append((before, after, at))
+    return np.concatenate([faces, np.array(more, faces.dtype).reshape(-1, 3)])
+
+
+def without_short(points: np.ndarray, faces: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a mesh with edges shorter than a length collapsed: vertices that remain ``(N,)``, and triangles over them.
+
+    An edge is collapsed to one of its ends, that on a border if one is; not where the surface would touch itself
+    (Dey et al., "Topology preserving edge contraction", 1999).
+
+    Args:
+        points: vertices [m], shape ``(V, 3)``.
+        faces: triangles, shape ``(T, 3)``.
+        least: the length [m].
+    """
+    around: list[set[tuple[int, int, int]]] = [set() for _ in points]
+    for face in faces.tolist():
+        for vertex in face:
+            around[vertex].add(tuple(face))
+    border = set(np.concatenate([*boundary_loops(faces), np.zeros(0, np.int64)]).tolist())
+    pairs = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
+    size = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    for stay, go in pairs[np.argsort(size, kind="stable")][: np.count_nonzero(size < least)].tolist():
+        if go in border and stay not in border:
+            stay, go = go, stay
+        shared = around[stay] & around[go]
+        if not shared or len(shared) != (1 if stay in border and go in border else 2):
+            continue  # no edge any more, or one across the inside between two borders
+        near = [{vertex for face in around[end] for vertex in face} - {stay, go} for end in (stay, go)]
+        if len(near[0] & near[1]) != len(shared):
+            continue
+        for face in list(around[go]):
+            for vertex in face:
+                around[vertex].discard(face)
+            if face not in shared:
+                moved = tuple(stay if vertex == go else vertex for vertex in face)
+                for vertex in moved:
+                    around[vertex].add(moved)
+    left = np.array(sorted({face for own in around for face in own}), faces.dtype)
+    there, left = np.unique(left, return_inverse=True)
+    return there, left.reshape(-1, 3).astype(faces.dtype)
 
 
 def flipped(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -167,7 +167,9 @@ def drape(garment: Garment, wearer: Wearer, proxy: Proxy, longest: float = _LONG
     for step in range(round(longest / _STEP)):
         graph.run()
         if failure.numpy()[0]:
-            raise ValueError(f"the {garment.kind} tears in the drape; choose other settings, or edges of another length")
+            raise ValueError(
+                f"the {garment.kind} tears in the drape; choose other settings, or edges of another length"
+            )
         if step > 15 and np.linalg.norm(cloth.state.v.numpy()[0], axis=1).max() < AT_REST:
             break
     return cloth.state.x.numpy()[0].astype(np.float64)
