@@ -15,11 +15,11 @@ from piavatar_envs.cloth.wearer import Wearer
 #: Distance of the upper edge from the hull of the shoulders [m].
 _EASE = 0.008
 #: Height of the upper edge, from the joints of the shoulders (0) to that of the neck (1).
-_HEIGHT = 0.5
+_HEIGHT = 0.45
 #: Length of a cape without one, over the way from its upper edge to the ankles.
 _TO_ANKLES = 0.8
-#: Angle by which the upper edge goes on from the shoulders to the front.
-_FRONT = 0.3
+#: Angle by which the upper edge goes on from the side of the shoulders to the front.
+_FRONT = -0.1
 
 
 def cut(

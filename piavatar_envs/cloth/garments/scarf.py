@@ -16,8 +16,8 @@ from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance from the skin at which a scarf is laid, and its thickness [m].
 _EASE, THICKNESS = 0.012, 0.006
-#: Length of a scarf without one over the wearer's height, and half the length that is held at the nape [m].
-_LENGTH, _HELD = 0.95, 0.045
+#: Length of a scarf without one over the wearer's height, and half the size of what is held at the nape [m].
+_LENGTH, _HELD = 0.95, 0.03
 #: Place of its middle line beside the neck over that of the shoulder's joint; way from the neck to where it falls, and
 #: width of what is measured, both over the wearer's height; and shift outwards over its width.
 _BESIDE, _CHEST, _NEAR, _SHIFT = 0.5, 0.09, 0.02, 0.1
@@ -55,7 +55,7 @@ def cut(
         return np.hypot(along[first] - along[second], across[first] - across[second])
 
     sees = np.full(len(along), TRUNK | HEAD | LEFT_LEG | RIGHT_LEG, np.int32)
-    held = np.flatnonzero(np.abs(along) < _HELD).astype(np.int32)
+    held = np.flatnonzero((np.abs(along) < _HELD) & (np.abs(across) < _HELD)).astype(np.int32)
     return Cut(fit(wearer), faces, sees, held, lengths, fit, THICKNESS)
 
 
