@@ -101,11 +101,17 @@ class Workspace:
 
 
 @wp.func
-def bending_force(p: Pattern, e: int, i: int, here: wp.vec3, x: wp.array2d(dtype=wp.vec3)):
-    """Return the force of bending on a vertex over the bending stiffness [m/m^2]."""
-    f = wp.vec3()
+def bending_force(p: Pattern, e: int, i: int, ahead: float, s: ClothState):
+    """Return the force of bending on a vertex over the bending stiffness [m/m^2], ``ahead`` [s] of now.
+
+    In the middle of the time for which it stays, it takes no energy to or from the fastest waves to first order; at its
+    beginning it would feed them.
+    """
+    here = vector_at(s.x, e, i) + ahead * vector_at(s.v, e, i)
+    f = wp.vec3(0.0)
     for k in range(int_at(p.bending_start, i), int_at(p.bending_start, i + 1)):
-        f -= float_at(p.bending_value, k) * (vector_at(x, e, int_at(p.bending_column, k)) - here)
+        j = int_at(p.bending_column, k)
+        f -= float_at(p.bending_value, k) * (vector_at(s.x, e, j) + ahead * vector_at(s.v, e, j) - here)
     return f
 
 
@@ -144,11 +150,11 @@ def renew_forces(
     here = vector_at(s.x, e, i)
     g = int_at(p.garment, i)
     r = row(e, fabric.bending.shape[0])
-    force = fabric.bending[r, g] * bending_force(p, e, i, here, s.x)
+    period = c.dt * float(wp.min(c.forces_every, remaining))
+    force = fabric.bending[r, g] * bending_force(p, e, i, 0.5 * period, s)
     h = int_at(p.held, i)
     if h >= 0:
-        impulse = (c.dt * float(wp.min(c.forces_every, remaining))) * force
-        w.pull[e, h] = w.pull[e, h] + impulse
+        w.pull[e, h] = w.pull[e, h] + period * force
     else:
         a = (float_at(p.inverse_area, i) / fabric.areal_density[r, g]) * force
         a += air_acceleration(p, c, fabric, r, e, i, here, vector_at(s.v, e, i), s.x)

@@ -15,8 +15,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from piavatar_envs.avatar.body.asset import vertex_normals
 from piavatar_envs.avatar.body.outfit import cut_triangles
-from piavatar_envs.avatar.body.registration import vertex_normals
 from piavatar_envs.cloth.pattern import ROW
 from piavatar_envs.cloth.remesh import boundary_loops, remesh
 from piavatar_envs.cloth.wearer import Wearer

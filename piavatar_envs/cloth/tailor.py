@@ -19,8 +19,7 @@ import warp as wp
 from scipy import sparse
 
 from piavatar_envs.avatar.body import sampling
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights
-from piavatar_envs.avatar.body.registration import vertex_normals
+from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights, vertex_normals
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.cloth import bodice, contact, kernels, panels, pattern, remesh, solver
 from piavatar_envs.cloth import mesh as meshing
@@ -39,9 +38,10 @@ from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Greatest speed of a vertex of a draped garment [m/s].
-AT_REST = 0.004
-#: Control step of the drape, its longest time [s], and the share of the velocity that it loses in a substep.
-_STEP, _LONGEST, _DAMPING = 1.0 / 30.0, 8.0, 0.02
+AT_REST = 0.002
+#: Control step of the drape and its longest time [s], share of the velocity that is lost in a substep, and number of
+#: steps in a row in which all of it must be slow.
+_STEP, _LONGEST, _DAMPING, _SLOW = 1.0 / 30.0, 12.0, 0.015, 10
 #: Passes over a garment in which weights of bones and changes of shape are smoothed.
 _BINDING = 12
 #: Modules whose code a made garment depends on.
@@ -77,7 +77,7 @@ def make_garment(
         return _made(kind, settings, fabric, asset, parameters, grading)
 
     source = sys.modules[cutter(kind).__module__]
-    if getattr(source, "__file__", None) is None:  # code that has no file cannot be told from other code
+    if getattr(source, "__file__", None) is None:  # code without a file has no digest
         arrays = compute()
     else:
         body = [asset.vertices, asset.faces, asset.skin_joints, asset.skin_weights, asset.shape_deltas]
@@ -164,13 +164,15 @@ def drape(garment: Garment, wearer: Wearer, proxy: Proxy, longest: float = _LONG
     cloth = Cloth([garment], still(wearer, proxy), None, settings, num_envs=1, control_dt=_STEP, device="cpu")
     failure, graph = wp.zeros(1, dtype=int, device="cpu"), LaunchGraph("cpu")
     cloth.record_step(graph, failure)
-    for step in range(round(longest / _STEP)):
+    slow = 0
+    for _ in range(round(longest / _STEP)):
         graph.run()
         if failure.numpy()[0]:
             raise ValueError(
                 f"the {garment.kind} tears in the drape; choose other settings, or edges of another length"
             )
-        if step > 15 and np.linalg.norm(cloth.state.v.numpy()[0], axis=1).max() < AT_REST:
+        slow = slow + 1 if np.linalg.norm(cloth.state.v.numpy()[0], axis=1).max() < AT_REST else 0
+        if slow == _SLOW:
             break
     return cloth.state.x.numpy()[0].astype(np.float64)
 

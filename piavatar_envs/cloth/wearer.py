@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, turned_shares
-from piavatar_envs.avatar.body.registration import vertex_normals
+from piavatar_envs.avatar.body.asset import AvatarAsset, turned_shares, vertex_normals
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.skeleton import joint_index
 

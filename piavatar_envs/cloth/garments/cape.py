@@ -19,7 +19,7 @@ _HEIGHT = 0.45
 #: Length of a cape without one, over the way from its upper edge to the ankles.
 _TO_ANKLES = 0.8
 #: Angle by which the upper edge goes on from the side of the shoulders to the front.
-_FRONT = -0.1
+_FRONT = -0.35
 
 
 def cut(
@@ -27,7 +27,7 @@ def cut(
     length: Annotated[float, Field(ge=0.1, le=1.6, description="from the shoulders to the hem [m]")] | None = None,
     flare: Annotated[
         float, Field(ge=0.2, le=1.0, description="angle of the pattern over that on the wearer: 1 a full circle [-]")
-    ] = 0.4,
+    ] = 0.35,
     edge: Annotated[float, Field(ge=0.01, le=0.1, description="length of the mesh's edges, about [m]")] = 0.035,
 ) -> Cut:
     """Return a cape.
