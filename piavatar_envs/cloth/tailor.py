@@ -168,9 +168,7 @@ def drape(garment: Garment, wearer: Wearer, proxy: Proxy, longest: float = _LONG
     for _ in range(round(longest / _STEP)):
         graph.run()
         if failure.numpy()[0]:
-            raise ValueError(
-                f"the {garment.kind} tears in the drape; choose other settings, or edges of another length"
-            )
+            raise ValueError(f"the {garment.kind} tears in the drape; change its settings, or length of edges")
         slow = slow + 1 if np.linalg.norm(cloth.state.v.numpy()[0], axis=1).max() < AT_REST else 0
         if slow == _SLOW:
             break

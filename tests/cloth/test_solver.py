@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.garments import free
 from benchmarks.garments.rows import CHECKS, Options
+from benchmarks.garments.sheets import LINEN, Run, flat_sheet, garment
 from benchmarks.physics.checks import HOLDS
-from tests.cloth.sheets import LINEN, Run, flat_sheet, garment
 
 #: Quantities that the usual number of steps does not reach.
 MISSED = (free.UNCONVERGED,)
