@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.paper.stage import Act, Script, View, keyed, played
+import numpy as np
+
+from benchmarks.paper.stage import Act, Pose, Script, View, keyed, played
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import list_motions, load_motion
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key, animate
 from piavatar_envs.config import AvatarConfig, PropConfig, RegionConfig, SceneConfig
+from piavatar_envs.config.schema import GarmentConfig
 from piavatar_envs.sim.scene import Domain
 
 BALL_RADIUS = 0.11
@@ -290,6 +293,61 @@ def cans(mesh: Path) -> list[Act]:
                 )
             )
     return found
+
+
+#: Speed of the spin [rev/s], the times at which it begins, is reached, ends, and stands still [s].
+SPIN_SPEED, SPIN_TIMES = 1.5, (0.2, 0.9, 2.0, 2.2)
+#: Times at which the body of the jump crouches, takes off, is highest, lands, crouches and stands [s].
+JUMP_TIMES = (0.35, 0.55, 0.8, 1.05, 1.25, 1.6)
+
+
+def spun(times: tuple[float, ...] = SPIN_TIMES, speed: float = SPIN_SPEED) -> Script:
+    """Return a spin on the spot with the arms held out, evenly faster and slower between the times [s], [rev/s]."""
+    arms = {"left_shoulder": (0.0, -0.6, 0.0), "right_shoulder": (0.0, 0.6, 0.0)}
+    out, turn = keyed((0.0, {}), (times[0], arms), (times[-1] + 9.0, arms)), 2.0 * np.pi * speed
+    begin, full, end, still = times
+
+    def angle(time: float) -> float:
+        rise, fall = np.clip(time - begin, 0.0, full - begin), np.clip(time - end, 0.0, still - end)
+        even = np.clip(time - full, 0.0, end - full)
+        return turn * (0.5 * rise**2 / (full - begin) + even + fall - 0.5 * fall**2 / (still - end))
+
+    def script(time: float) -> Pose:
+        rotation, root = out(time)
+        rotation[0] = (0.0, 0.0, angle(time))
+        return rotation, root
+
+    return script
+
+
+def leapt() -> Script:
+    """Return a jump on the spot: a crouch, 0.35 m up and down again, and a landing in a crouch."""
+    crouch = {"root": (0.0, 0.02, -0.2)}
+    for side in ("left", "right"):
+        crouch |= {
+            f"{side}_hip": (-0.9, 0.0, 0.0),
+            f"{side}_knee": (1.55, 0.0, 0.0),
+            f"{side}_ankle": (-0.65, 0.0, 0.0),
+        }
+    down, off, top, land, low, up = JUMP_TIMES
+    tips = {"left_ankle": (0.5, 0.0, 0.0), "right_ankle": (0.5, 0.0, 0.0)}
+    arms = {"left_shoulder": (0.0, -0.7, 0.0), "right_shoulder": (0.0, 0.7, 0.0)}
+    return keyed(
+        (0.0, {}), (down, crouch), (off, {"root": (0.0, 0.0, 0.08), **tips, **arms}),
+        (top, {"root": (0.0, 0.0, 0.35), **tips, **arms}), (land, {"root": (0.0, 0.0, 0.02), **arms}), (low, crouch),
+        (up, {}),
+    )  # fmt: skip
+
+
+def dresses() -> list[Act]:
+    """Return acts of a body in a dress that spins and stops, and that jumps."""
+    dress = GarmentConfig(kind="dress", fabric="cotton")
+    spin = View(eye=(0.9, -3.6, 1.25), target=(0.0, 0.0, 0.8), moments=(0.2, 0.6, 1.2, 1.9, 2.2, 2.5, 3.0))
+    leap = replace(spin, target=(0.0, 0.0, 0.95), moments=(0.3, 0.5667, 0.8, 1.0, 1.1333, 1.3, 1.9))
+    return [
+        Act("spin in a dress", 3.2, garments=(dress,), script=spun(), view=spin, tags={"rev_s": SPIN_SPEED}),
+        Act("jump in a dress", 2.4, garments=(dress,), script=leapt(), view=leap, tags={"rev_s": None}),
+    ]
 
 
 def _modulus(regions: tuple[RegionConfig, ...]) -> float | None:

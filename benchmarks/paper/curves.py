@@ -6,6 +6,7 @@ import numpy as np
 
 from benchmarks.paper import acts
 from benchmarks.paper.measures import around_hit, belly_flesh, near, overlap_of_legs, strain_by_height
+from benchmarks.paper.measures import hem_lift as measured_lift
 from benchmarks.paper.stage import Course
 
 #: Curves by name; the only one of an act has none.
@@ -31,6 +32,11 @@ def head_angle(course: Course) -> Curves:
 def leg_angle(course: Course) -> Curves:
     """Return the sum of the angles by which the kicking leg is bent away from its command [deg]."""
     return {"": course.errors_of("right_hip", "right_knee", "right_ankle", "right_foot")}
+
+
+def hem_lift(course: Course) -> Curves:
+    """Return how much higher the hem of a garment is over the pelvis than at the start [mm]."""
+    return {"": 1e3 * measured_lift(course)}
 
 
 def leg_overlap(course: Course) -> Curves:

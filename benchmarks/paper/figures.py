@@ -237,6 +237,17 @@ def figures() -> dict[str, Figure]:
             lambda course: {"": curves.impulses(course)["pillow"]},
             columns=True,
         ),
+        "loose_garment": Figure(
+            "A dress in a spin that stops, and in a jump: it lags behind the body, flares out unevenly, floats, and "
+            "swings on (Figure 10).",
+            lambda _: acts.dresses(),
+            ("spin", "jump"),
+            measures.loose_garment,
+            partial(over_time, label="rise of the hem against the pelvis [mm]"),
+            curves.hem_lift,
+            film=2.8,
+            filmed=(0, 1),
+        ),
         "regions": Figure(
             "A can of 0.35 kg at head, belly and ankle at 3 m/s, on flesh and on hair, cloth and a stiff boot of other "
             "materials (Figure 8).",

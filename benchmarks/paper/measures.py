@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.paper import acts
 from benchmarks.paper.stage import Course
@@ -18,6 +19,7 @@ NEAR = 0.12  # [m] from where something hits
 TOUCH = 0.01  # [N s] in a control step
 FRONT = 0.02  # |F - R| of a front of strain
 SLICE, TRUNK, LEAST_HEIGHT = 0.08, 0.2, 0.2  # [m]: thickness, half width, and height above the feet
+HEM = 0.02  # [m] of height above the lowest vertex of a garment
 JIGGLING = 0.6  # softness of the flesh that is watched
 
 
@@ -217,6 +219,54 @@ def jump(course: Course) -> Row:
         "peak_at_s": float(course.time[peak]),
         "rms_0.3_s_later_mm": float(later),
         "peak_joint_error_deg": float(course.joint_errors.max()),
+    }
+
+
+def hem_of(course: Course) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest vertices of the first garment ``(n,)``, and where they are in the pelvis' frame over time.
+
+    Returns:
+        The vertices; their places about the pelvis joint, turned back by its yaw [m], shape ``(T, n, 3)``.
+    """
+    garment = course.stage.simulation.garments.garments[0]
+    height = garment.draped[:, 2]
+    hem = np.flatnonzero(height < height.min() + HEM)
+    offset = course.cloth[:, hem] - course.joints[:, None, 0]
+    forward = Rotation.from_quat(course.bones[:, 0].astype(float)).apply([1.0, 0.0, 0.0])
+    yaw = np.arctan2(forward[:, 1], forward[:, 0])
+    cosine, sine = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = offset[..., 0], offset[..., 1]
+    return hem, np.stack([cosine * x + sine * y, cosine * y - sine * x, offset[..., 2]], axis=-1)
+
+
+def hem_lift(course: Course) -> np.ndarray:
+    """Return how much higher the hem is over the pelvis than at the start [m], shape ``(T,)``."""
+    height = hem_of(course)[1][..., 2].mean(axis=1)
+    return height - height[0]
+
+
+def loose_garment(course: Course) -> Row:
+    """Measure how a garment's hem lags, lifts, billows unevenly and swings on, and how far its cloth is stretched."""
+    hem, places = hem_of(course)
+    angle = np.unwrap(np.arctan2(places[..., 1], places[..., 0]), axis=0)
+    lag = np.degrees((angle - angle[0]).mean(axis=1))
+    radius, lift = np.linalg.norm(places[..., :2], axis=-1), hem_lift(course)
+    speed = np.linalg.norm(np.diff(course.cloth[:, hem], axis=0), axis=-1).mean(axis=1) / course.stage.dt
+    garment = course.stage.simulation.garments.garments[0]
+    strain = garment.mesh.strain(course.cloth[:, : garment.mesh.num_vertices].astype(float))
+    rms = np.sqrt((strain**2).mean(axis=1))
+    return {
+        "vertices": garment.mesh.num_vertices,
+        "peak_lag_deg": float(np.abs(lag).max()),
+        "peak_lift_mm": 1e3 * float(lift.max()),
+        "lowest_mm": 1e3 * float(lift.min()),
+        "peak_unevenness_mm": 1e3 * float(radius.std(axis=1).max()),
+        "unevenness_at_rest_mm": 1e3 * float(radius[0].std()),
+        "peak_hem_speed_m_s": float(speed.max()),
+        "settled_hem_speed_m_s": settled(course, np.append(speed[:1], speed)),
+        "mean_edge_strain_rms": float(rms.mean()),
+        "worst_edge_strain_rms": float(rms.max()),
+        "largest_edge_strain": float(strain.max()),
     }
 
 

@@ -17,6 +17,7 @@ from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.motion import ease
 from piavatar_envs.config import BodyColor, EnvConfig, RenderConfig, SceneConfig, load_config
+from piavatar_envs.config.schema import GarmentConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.render.quantities import of_particles
 from piavatar_envs.sim.scene import Domain
@@ -93,6 +94,7 @@ class Act:
         name: of the act.
         seconds: how long it is.
         scene: avatar, props and colliders.
+        garments: that the avatar wears.
         script: commanded poses.
         physics, control: settings that differ from the environments' own.
         domain: where matter may go; the usual one if not given.
@@ -103,6 +105,7 @@ class Act:
     name: str
     seconds: float
     scene: SceneConfig = field(default_factory=SceneConfig)
+    garments: tuple[GarmentConfig, ...] = ()
     script: Script = standing
     physics: dict[str, Any] = field(default_factory=dict)
     control: dict[str, Any] = field(default_factory=dict)
@@ -147,6 +150,7 @@ class Stage:
         physics = {"fidelity": fidelity, **act.physics}
         render = {"camera_position": act.view.eye, "camera_target": act.view.target}
         settings = {"physics": physics, "control": act.control, "scene": act.scene, "render": render}
+        settings["garments"] = act.garments
         self.config = config = load_config(EnvConfig, settings)
         self.simulation = Simulation(config, 1, device, act.domain)
         self.task = _Backdrop(config, act.view.eye, act.view.target)
@@ -191,6 +195,7 @@ class Course:
         impulse: on the body parts from every subject, shape ``(T, 6, S, 3)`` [N s].
         penetration: depth of the subjects in each other, shape ``(T, S)`` [m].
         distortion: ``|F - R|`` of the avatar's particles, shape ``(T, A)``.
+        cloth: vertices of all garments [m], shape ``(T, V, 3)``.
         frames: pictures at the view's moments, in the view's colours.
     """
 
@@ -207,6 +212,7 @@ class Course:
     impulse: np.ndarray
     penetration: np.ndarray
     distortion: np.ndarray
+    cloth: np.ndarray
     frames: tuple[np.ndarray, ...] = ()
 
     @property
@@ -292,5 +298,7 @@ def _look(stage: Stage) -> dict[str, np.ndarray]:
         "penetration": sensors.penetration,
     }
     copies = {name: array.numpy()[0].copy() for name, array in arrays.items()}
+    worn = simulation.garments
+    copies["cloth"] = np.zeros((0, 3), np.float32) if worn is None else worn.cloth.state.x.numpy()[0].copy()
     own = slice(avatar.body.first, avatar.body.first + avatar.body.count)
     return copies | {"distortion": of_particles(simulation, 0, own, "distortion")}
