@@ -97,8 +97,7 @@ def bytes_of_stage(simulation: Simulation, markers: Sequence[MarkerSpec] = ()) -
 
 def _garments(simulation: Simulation) -> Sequence[Garment]:
     """Return the garments of a simulation."""
-    worn = getattr(simulation, "garments", None)
-    return () if worn is None else worn.garments
+    return () if simulation.garments is None else simulation.garments.garments
 
 
 def _drawn_assets(simulation: Simulation) -> list[AvatarAsset]:
