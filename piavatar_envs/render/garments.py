@@ -19,6 +19,7 @@ import warp as wp
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.render.subdivision import levels_for, subdivided
+from piavatar_envs.render.wearing import layering
 
 if TYPE_CHECKING:
     from piavatar_envs.cloth.garment import Garment
@@ -35,23 +36,27 @@ class GarmentMesh:
 
     Attributes:
         rows: shares of the ``V`` vertices of its cloth in its points: offsets ``(W + 1,)``, vertices and weights.
+        depth: by which its points sink beneath garments that are worn over it [m], shape ``(W,)``.
         faces: closed, outward triangles over ``2 W`` vertices, the outer side first, shape ``(U, 3)`` int32.
         colors: sRGB of these vertices, shape ``(2 W, 3)`` uint8.
     """
 
     rows: tuple[np.ndarray, np.ndarray, np.ndarray]
+    depth: np.ndarray
     faces: np.ndarray
     colors: np.ndarray
 
     @staticmethod
-    def of(garment: Garment) -> GarmentMesh:
-        """Divide a garment, close its borders, and colour its sides."""
+    def of(garment: Garment, over: Sequence[Garment] = ()) -> GarmentMesh:
+        """Divide a garment, close its borders, colour its sides, and let it sink beneath those ``over`` it."""
         levels = levels_for(garment.mesh.faces, garment.draped, _EDGE)
         fine = subdivided(garment.mesh.faces, garment.mesh.num_vertices, levels)
         matrix, sides = fine.matrix, np.array([garment.fabric.front, garment.fabric.back])
         colors = np.rint(255.0 * np.clip(sides, 0.0, 1.0)).astype(np.uint8)
         rows = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
-        return GarmentMesh(rows, both_sides(fine.faces, matrix.shape[0]), np.repeat(colors, matrix.shape[0], axis=0))
+        depth = matrix @ np.max([np.zeros(matrix.shape[1]), *(layering(garment, other) for other in over)], axis=0)
+        faces = both_sides(fine.faces, matrix.shape[0])
+        return GarmentMesh(rows, depth, faces, np.repeat(colors, matrix.shape[0], axis=0))
 
     @property
     def num_vertices(self) -> int:
@@ -83,6 +88,7 @@ class ClothSurface:
     start: wp.array(dtype=int)  # (W + 1,)
     vertex: wp.array(dtype=int)  # that move a point
     weight: wp.array(dtype=float)
+    depth: wp.array(dtype=float)  # (W,) by which a point sinks beneath other garments [m]
     outer: wp.array(dtype=int)  # (W,) drawn vertex of a point's outer side
     inner: wp.array(dtype=int)  # (W,) and of its inner side
 
@@ -126,9 +132,10 @@ def place_cloth(
         v = surface.vertex[k]
         at += surface.weight[k] * x[e, v]
         normal += surface.weight[k] * normals[i, v]
-    aside = half * wp.normalize(normal)
-    vertices[i, first + surface.outer[w]] = at + aside
-    vertices[i, first + surface.inner[w]] = at - aside
+    normal = wp.normalize(normal)
+    at -= surface.depth[w] * normal
+    vertices[i, first + surface.outer[w]] = at + half * normal
+    vertices[i, first + surface.inner[w]] = at - half * normal
 
 
 class Drapery:
@@ -139,8 +146,11 @@ class Drapery:
     """
 
     def __init__(self, garments: Sequence[Garment]) -> None:
-        """Divide the garments, which follow one another among the vertices of the cloth."""
-        self.meshes = [GarmentMesh.of(garment) for garment in garments]
+        """Divide the garments, which follow one another among the vertices of the cloth; later ones are worn over."""
+        self.meshes = [
+            GarmentMesh.of(own, [other for other in garments[index + 1 :] if own.wearer == other.wearer >= 0])
+            for index, own in enumerate(garments)
+        ]
         self._cloth = [garment.mesh for garment in garments]
 
     @property
@@ -200,6 +210,7 @@ class Drapery:
             start=upload(np.concatenate([[0], np.cumsum(np.concatenate(counts))]), int),
             vertex=upload(np.concatenate(columns), int),
             weight=upload(np.concatenate(weights), float),
+            depth=upload(np.concatenate([mesh.depth for mesh in self.meshes]), float),
             outer=upload(np.concatenate(outer), int),
             inner=upload(np.concatenate(inner), int),
         )

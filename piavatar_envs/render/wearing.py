@@ -27,13 +27,14 @@ if TYPE_CHECKING:
     from piavatar_envs.cloth.garment import Garment
 
 #: Depth to which a surface sinks where cloth lies on it, and where it hangs apart [m].
-_TIGHT, _LOOSE = 0.014, 0.006
+_TIGHT, _LOOSE = 0.014, 0.010
 #: Distance of cloth that lies on a surface, and of cloth that hangs before it, at most [m].
 _NEAR, _FAR = 0.03, 0.15
-#: Way from a border over which sinking sets in: inside, and outside of one that is held, such as a waistband [m].
-_INSIDE, _OUTSIDE = 0.03, 0.03
-#: Depth at a held border, where an outfit would lie on the cloth [m].
-_TUCKED = 0.007
+#: Ways from a border over which sinking sets in: inside, where cloth lies on a surface and where it hangs apart, which
+#: may be seen; and outside of one that is held, such as a waistband [m].
+_INSIDE, _FAR_INSIDE, _OUTSIDE = 0.03, 0.10, 0.03
+#: Depth at a held border, where an outfit would lie on the cloth, and of a garment beneath another one [m].
+_TUCKED, _LAYER = 0.007, 0.009
 #: Greatest distance of points of a garment, among which the nearest is looked for [m].
 _SPACING = 0.01
 #: Share of the chest that a garment covers which replaces a painted shirt.
@@ -78,10 +79,22 @@ def sinking(garment: Garment, points: np.ndarray, normals: np.ndarray) -> np.nda
         normals: of the surface, outward, shape ``(V, 3)``.
     """
     gap, inside, edge, held = _covered(garment, points, normals)[1:]
-    inward = np.clip(edge / _INSIDE, 0.0, 1.0)
-    deep = _LOOSE + (_TIGHT - _LOOSE) * np.clip(2.0 - gap / _NEAR, 0.0, 1.0)
+    share = np.clip(2.0 - gap / _NEAR, 0.0, 1.0)
+    deep = share * _TIGHT * np.clip(edge / _INSIDE, 0.0, 1.0)
+    deep += (1.0 - share) * _LOOSE * np.clip(edge / _FAR_INSIDE, 0.0, 1.0)
     tucked = np.where(held < _OUTSIDE, _TUCKED * (1.0 - np.clip(held / _OUTSIDE, 0.0, 1.0)), 0.0)
-    return np.maximum(np.where(inside, deep * inward, 0.0), tucked)
+    return np.maximum(np.where(inside, deep, 0.0), tucked)
+
+
+def layering(inner: Garment, outer: Garment) -> np.ndarray:
+    """Return how far the vertices of a garment sink beneath another one that is worn over it [m], shape ``(V,)``.
+
+    Cloth does not touch cloth, so that both lie equally far from the skin.
+    """
+    normals = vertex_normals(inner.draped, inner.mesh.faces)
+    _, gap, inside, edge, _ = _covered(outer, inner.draped, normals)
+    outside = np.where(edge > 0.0, 0.0, gap)
+    return np.where(inside & (gap < _NEAR), _LAYER * np.clip(1.0 - outside / _OUTSIDE, 0.0, 1.0), 0.0)
 
 
 def _covered(

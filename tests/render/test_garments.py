@@ -117,8 +117,19 @@ def test_skin_sinks_beneath_cloth_and_nowhere_else():
     on, loose, outside, other_way = depths(0.195), depths(0.12), depths(0.22), depths(0.195, -1.0)
     assert on[:2] == pytest.approx(0.0) and 0.0 < on[2] < on[3] == pytest.approx(on[4]) == pytest.approx(0.014)
     assert 0.0 < on[6] < 0.008 and on[7] == 0.0  # above the waistband
-    assert loose[4] == pytest.approx(0.006, rel=1e-3)
+    assert loose[4] == pytest.approx(0.010, rel=1e-3) and 0.0 < loose[2] < 0.003
     assert outside[:5] == pytest.approx(0.0) and other_way[:5] == pytest.approx(0.0)
+
+
+def test_a_garment_sinks_beneath_another_one(make_batch, put_on):
+    batch = make_batch(REACH)
+    shirt = tube(0.7, 1.3, 0.205, kind="shirt", rows=14)
+    put_on(batch.simulation, tube(0.1, 0.95, 0.2, kind="trousers", rows=20), shirt)
+    stage = Stage(batch.simulation, batch.task.marker_specs())
+    trousers = seen(batch, stage)[0, stage.parts[-2].vertices]
+    away, height = np.linalg.norm(trousers[:, :2], axis=1), trousers[:, 2]
+    assert away[height > 0.72].max() < 0.195 and away[height < 0.66].min() > 0.195
+    assert np.linalg.norm(seen(batch, stage)[0, stage.parts[-1].vertices][:, :2], axis=1).min() > 0.2
 
 
 def test_a_body_in_a_shirt_does_not_wear_the_painted_one(make_batch, put_on):
