@@ -159,7 +159,8 @@ class Randomization:
         n, device = self.model.num_envs, self.model.device
         bounds = [getattr(self.config, name) for name in names]
         self.factors = wp.array(np.ones((n, len(names)), np.float32), dtype=float, device=device)
-        self._bounds = wp.array(np.array(bounds, np.float32), dtype=wp.vec2, device=device)
+        bounds = np.repeat([bounds], n, 0).astype(np.float32)
+        self._names, self._bounds = tuple(names), wp.array(bounds, dtype=wp.vec2, device=device)
 
     def scale_cloth(self, fabric: Fabrics) -> None:
         """Let factors multiply the properties of all garments; to be called before a launch binds them."""
@@ -200,6 +201,24 @@ class Randomization:
         if name in OF_CLOTH:
             return self.factors[:, list(OF_CLOTH).index(name) - len(OF_CLOTH) + self.factors.shape[1]]
         return self.factors[:, len(OF_WORLD) + avatar * len(OF_AVATAR) + list(OF_AVATAR).index(name)]
+
+    def fix(self, name: str, values: np.ndarray) -> None:
+        """Set a factor of every environment, of all its avatars, from the next reset on; it is drawn no more.
+
+        Args:
+            name: of a factor that varies.
+            values: factor of each environment, shape ``(num_envs,)``.
+
+        Raises:
+            ValueError: the factor does not vary, or a value lies outside the range that the time step is chosen for.
+        """
+        low, high = getattr(self.config, name)
+        values = np.asarray(values, np.float64)
+        if not self._varies(name) or not ((low <= values) & (values <= high)).all():
+            raise ValueError(f"{name}={values.tolist()} must lie in the range randomize.{name}=[{low:g}, {high:g}]")
+        bounds = self._bounds.numpy().copy()
+        bounds[:, [own == name for own in self._names]] = values[:, None, None]
+        self._bounds.assign(bounds)
 
     def _scale(self, factor: int, holder: Any, name: str, key: str, part: slice = slice(None)) -> wp.array:
         """Let a factor multiply columns ``part`` of the array ``name`` of ``holder``; return their nominal values."""
@@ -295,19 +314,21 @@ def draw_factors(
     mask: wp.array(dtype=wp.bool),
     seed: wp.array(dtype=int),
     episode: wp.array(dtype=int),
-    bounds: wp.array(dtype=wp.vec2),
+    bounds: wp.array2d(dtype=wp.vec2),
     # out
     factors: wp.array2d(dtype=float),
 ):
     """Draw the factors of the masked environments, uniform in their logarithm; over ``(num_envs, factors)``.
+
+    The bounds are those of each environment.
 
     Each factor has an index of its own, so that it does not depend on which others vary.
     """
     e, n = wp.tid()
     if not mask[e]:
         return
-    low = bounds[n][0]
-    high = bounds[n][1]
+    low = bounds[e, n][0]
+    high = bounds[e, n][1]
     random = generator(seed[e], episode[e], STREAM_PARAMETERS, n)
     factors[e, n] = wp.clamp(wp.exp(wp.randf(random, wp.log(low), wp.log(high))), low, high)
 

@@ -59,7 +59,7 @@ def drawn_factors(device, seeds, episodes, bounds) -> np.ndarray:
     out = wp.zeros((n, len(bounds)), dtype=float, device=device)
     inputs = [wp.array(np.ones(n, bool), dtype=wp.bool, device=device)]
     inputs += [wp.array(np.asarray(a, np.int32), dtype=int, device=device) for a in (seeds, episodes)]
-    inputs += [wp.array(np.asarray(bounds, np.float32), dtype=wp.vec2, device=device)]
+    inputs += [wp.array(np.repeat([bounds], n, 0).astype(np.float32), dtype=wp.vec2, device=device)]
     wp.launch(draw_factors, out.shape, inputs, [out], device=device)
     return out.numpy()
 
@@ -76,6 +76,27 @@ def test_factors_are_uniform_in_their_logarithm(device):
             assert np.abs(share - (np.arange(n) + 0.5) / n).max() < 2.0 / np.sqrt(n)
         assert (drawn[:, 2] == 2.0).all()
         assert abs(np.corrcoef(np.log(drawn[:, 0]), np.log(drawn[:, 1]))[0, 1]) < 3.5 / np.sqrt(n)
+
+
+def test_fixed_factors_are_those_of_each_environment(make_batch):
+    # The same factors as episodes that draw each from a range of one value; other factors are drawn as before.
+    plain, batch = make_batch(REACH, 3, **VARIED), make_batch(REACH, 3, **VARIED)
+    values = np.array([0.5, 0.8, 1.6])
+    batch.simulation.randomization.fix("mass_factor", values)
+    for seeds in ([4, 5, 6], None):
+        plain.reset(seeds=seeds)
+        batch.reset(seeds=seeds)
+        drawn, factors = factors_of(plain), factors_of(batch)
+        assert np.array_equal(factors.pop("mass_factor")[:, 0], values.astype(np.float32))
+        assert all(np.array_equal(factor, drawn[name]) for name, factor in factors.items())
+    alone = make_batch(REACH, 1, **VARIED | {"randomize.mass_factor": (0.8, 0.8)})
+    alone.reset(seeds=[5])
+    alone.reset()
+    assert np.array_equal(constants_of(alone)["mass"][0], constants_of(batch)["mass"][1])
+    with pytest.raises(ValueError, match=r"mass_factor=.* must lie in the range"):
+        batch.simulation.randomization.fix("mass_factor", np.full(3, 1.7))
+    with pytest.raises(ValueError, match=r"stiffness_factor=.* must lie in the range"):
+        make_batch(REACH, 1).simulation.randomization.fix("stiffness_factor", np.ones(1))
 
 
 # The time step.
