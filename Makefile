@@ -4,11 +4,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-EXTRAS := render,live,train,motions,multi,props,skrl,rsl,bench,dev
+EXTRAS := render,live,train,fit,motions,multi,props,skrl,rsl,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test test-lowest test-avatars clients-light lint format docs clean
+.PHONY: help install demo test test-lowest test-avatars test-vlm clients-light lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
@@ -16,6 +16,7 @@ help:
 	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
 	@echo "make test-lowest   test the views under the oldest supported Gymnasium and PettingZoo"
 	@echo "make test-avatars  compare avatars and motions with MakeHuman's data, body-models, pybvh and gsply"
+	@echo "make test-vlm      test the judge of agents.fit with a tiny vision-language model of transformers"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code and build the site in build/site (PICTURES=1 draws the pages' pictures, too; CHECK=1 compares the pages only)"
@@ -68,6 +69,16 @@ $(REFERENCES)/.installed: $(STAMP) tests/avatar/requirements.txt
 
 test-avatars: $(REFERENCES)/.installed
 	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py splats.py) tests/render/test_film_files.py -k "makehuman or published or body_models or pybvh or gsply or usd"
+
+# Libraries of vision-language models, in a folder of their own; the model is written by the tests.
+VLM := $(VENV)/vlm
+$(VLM)/.installed: $(STAMP) tests/agents/requirements.txt
+	rm -rf $(VLM)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(VLM) --requirement tests/agents/requirements.txt
+	@touch $@
+
+test-vlm: $(VLM)/.installed
+	PYTHONPATH=$(VLM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/agents/test_fit_vlm.py
 
 # Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
 # imports and compilation take longer than the tests.

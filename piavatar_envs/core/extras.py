@@ -9,6 +9,8 @@ from pathlib import Path
 #: Modules by extra; an extra is present if all of its modules are.
 EXTRAS = {
     "render": ("imageio", "imageio_ffmpeg", "PIL"),
+    "fit": ("optuna",),
+    "vlm": ("transformers",),
     "train": ("stable_baselines3", "torch", "matplotlib", "tensorboard"),
     "motions": ("pybullet_data",),
     "props": ("trimesh",),
