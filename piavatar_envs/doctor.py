@@ -78,18 +78,30 @@ def kernel_cache() -> dict[str, Any]:
 
 
 def memory_estimate() -> dict[str, Any]:
-    """Return particles, grid nodes, substeps a step and bytes of one environment with default settings."""
+    """Return particles, grid nodes, substeps a step and bytes of one environment with default settings.
+
+    Besides, the vertices of a skirt and the bytes that an environment has more with one.
+    """
+    from piavatar_envs.cloth.garments import cut_garment
+    from piavatar_envs.cloth.mesh import ClothMesh
+    from piavatar_envs.cloth.wearer import Wearer
     from piavatar_envs.config import EnvConfig
     from piavatar_envs.mpm.bspline import BLOCK_NODES
     from piavatar_envs.mpm.memory import estimate_bytes
+    from piavatar_envs.sim.garments import bytes_of_garments
     from piavatar_envs.sim.world import Simulation
 
-    model = Simulation(EnvConfig(), num_envs=1, device="cpu").model
+    simulation = Simulation(EnvConfig(), num_envs=1, device="cpu")
+    model, flesh = simulation.model, simulation.flesh
+    cut = cut_garment("skirt", Wearer.of(flesh[0].asset, flesh[0].base_parameters), {})
+    skirt = ClothMesh.build(cut.faces, cut.measure)
     nodes = int(BLOCK_NODES) * model.max_active_blocks
     size = {"particles": model.num_particles, "nodes": nodes, "substeps": model.num_substeps}
     return {
         **size,
         "bytes": estimate_bytes(1, model.num_particles, model.max_active_blocks, num_blocks=model.num_blocks),
+        "skirt_vertices": skirt.num_vertices,
+        "skirt_bytes": bytes_of_garments([skirt], flesh, ()),
     }
 
 
@@ -164,6 +176,8 @@ def show(report: dict[str, Any], *, as_json: bool = False) -> None:
     size = report["default_env"]
     shape = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps a step"
     table.add_row("default env", f"{shape}: {size['bytes'] / 2**20:.1f} MiB each")
+    skirt = f"{size['skirt_vertices']} vertices: {size['skirt_bytes'] / 2**20:.1f} MiB more in an environment"
+    table.add_row("with a skirt", skirt)
     if "compile" in report:
         table.add_row("compiled", f"for {report['compile']['device']} in {report['compile']['seconds']} s")
     Console(highlight=False, soft_wrap=True, markup=False).print(table)

@@ -185,20 +185,20 @@ class _Worn:
         self.workspace = skin_workspace(self.surface, avatar.model.num_envs, device)
 
 
-def bytes_of_garments(garments: Sequence[Garment], flesh: Sequence[Flesh], points: Sequence[PropPoints]) -> int:
+def bytes_of_garments(meshes: Sequence[ClothMesh], flesh: Sequence[Flesh], points: Sequence[PropPoints]) -> int:
     """Estimate the memory of the garments of an environment and of what they touch [bytes]; 0 without garments.
 
     Args:
-        garments: of the world.
+        meshes: of all garments.
         flesh: of all avatars.
         points: of all props.
     """
-    if not garments:
+    if not meshes:
         return 0
     surface = len(flesh) * PROXY_VERTICES + sum(min(len(own.vertices), MOST_PROP_VERTICES) for own in points)
-    skins = sum(skin_bytes(len(own.points.rest[0])) for own in flesh) + len(garments) * skin_bytes(0)
+    skins = sum(skin_bytes(len(own.points.rest[0])) for own in flesh) + len(meshes) * skin_bytes(0)
     slots = 2 if len(flesh) + len(points) > 1 else 1
-    return bytes_of_obstacles(surface) + skins + sum(bytes_of_cloth(own.mesh, slots) for own in garments)
+    return bytes_of_obstacles(surface) + skins + sum(bytes_of_cloth(own, slots) for own in meshes)
 
 
 @wp.kernel
