@@ -19,6 +19,8 @@ order of the threads.
 
 from __future__ import annotations
 
+from functools import cache
+
 import warp as wp
 
 from piavatar_envs.cloth.contact import (
@@ -34,6 +36,15 @@ from piavatar_envs.cloth.contact import (
     search,
 )
 from piavatar_envs.cloth.obstacles import Obstacles
+from piavatar_envs.cloth.self_contact import (
+    APPROACH,
+    SelfContacts,
+    corrected,
+    insert_vertex,
+    keep_apart,
+    search_self,
+    take_correction,
+)
 from piavatar_envs.cloth.types import ClothState, Fabrics
 from piavatar_envs.core.arrays import float_at, int_at, number_at, set_vector, vector_at
 from piavatar_envs.core.cuda_intrinsics import sync_block, thread_of_block, threads_of_block
@@ -41,6 +52,10 @@ from piavatar_envs.mpm.types import Boundaries, row
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 0, "default_grid_stride": False})
 
+#: Threads of an environment on a GPU: a CUDA block, of one size, because a module is compiled for each size.
+THREADS = 256
+#: CUDA blocks that share a multiprocessor: more hide more of the latency of its barriers.
+BLOCKS = 4
 #: Shorter edges [m] have no direction.
 _NO_LENGTH = wp.constant(1.0e-12)
 
@@ -173,7 +188,9 @@ def predict(p: Pattern, c: Constants, o: Obstacles, s: ClothState, w: Workspace,
     """Move a vertex by its velocity and the forces, or with the skin that holds it."""
     h = int_at(p.held, i)
     if h >= 0:
-        set_vector(s.x, e, i, held_place(p, o, e, h, share))
+        z = held_place(p, o, e, h, share)
+        set_vector(s.v, e, i, (z - vector_at(s.x, e, i)) / c.dt)
+        set_vector(s.x, e, i, z)
     else:
         u = vector_at(s.v, e, i) + c.dt * (c.gravity + vector_at(w.acceleration, e, i))
         set_vector(s.v, e, i, u)
@@ -274,8 +291,61 @@ def collect_pull(p: Pattern, s: ClothState, o: Obstacles, w: Workspace, e: int, 
     w.pull[e, h] = wp.vec3(0.0)
 
 
-@wp.kernel
-def advance_cloth(
+@wp.func
+def inverse_mass(p: Pattern, fabric: Fabrics, r: int, i: int):
+    """Return the inverse of a vertex's mass [1/kg], 0 for held ones."""
+    return float_at(p.inverse_area, i) / fabric.areal_density[r, int_at(p.garment, i)]
+
+
+@wp.func
+def search_all_selves(
+    p: Pattern, c: Constants, s: ClothState, w: Workspace, contacts: SelfContacts, e: int, thread: int, threads: int
+):
+    """Search the triangles that vertices may touch until the next search; all threads of a block call this."""
+    for n in range(thread, contacts.first.shape[1], threads):
+        contacts.first[e, n] = -1
+    sync_block()
+    for i in range(thread, s.x.shape[1], threads):
+        insert_vertex(contacts, e, i, corrected(s.x, w.correction, e, i))
+    sync_block()
+    for i in range(thread, s.x.shape[1], threads):
+        reach = p.thickness[int_at(p.garment, i)] + APPROACH * c.dt * float(c.look_every)
+        search_self(contacts, p.fan_start, p.fan, s.x, w.correction, e, i, reach)
+
+
+@wp.func
+def push_self(
+    p: Pattern, c: Constants, fabric: Fabrics, s: ClothState, w: Workspace, contacts: SelfContacts, e: int, i: int
+):
+    """Push a vertex and the triangle that it touches apart."""
+    f = contacts.corners[e, i]
+    if f[0] >= 0:
+        r = row(e, fabric.areal_density.shape[0])
+        g = int_at(p.garment, i)
+        masses = wp.vec4(
+            inverse_mass(p, fabric, r, i),
+            inverse_mass(p, fabric, r, f[0]),
+            inverse_mass(p, fabric, r, f[1]),
+            inverse_mass(p, fabric, r, f[2]),
+        )
+        friction = fabric.friction[r, g]
+        keep_apart(contacts, s.x, w.correction, s.v, masses, e, i, p.thickness[g], friction, c.pop, c.dt)
+
+
+@wp.func
+def apply_self(p: Pattern, c: Constants, fabric: Fabrics, w: Workspace, contacts: SelfContacts, e: int, i: int):
+    """Correct a vertex by all of its contacts with cloth; a held one passes the impulse on."""
+    P = take_correction(contacts, e, i)
+    h = int_at(p.held, i)
+    if h >= 0:
+        w.pull[e, h] = w.pull[e, h] + P / c.dt
+    else:
+        change = inverse_mass(p, fabric, row(e, fabric.areal_density.shape[0]), i) * P
+        set_vector(w.correction, e, i, vector_at(w.correction, e, i) + change)
+
+
+@wp.func
+def advance(
     p: Pattern,
     c: Constants,
     fabric: Fabrics,
@@ -286,10 +356,12 @@ def advance_cloth(
     s: ClothState,
     w: Workspace,
     touches: Touches,
+    contacts: SelfContacts,
     failure: wp.array(dtype=int),
+    e: int,
+    self_collision: bool,
 ):
-    """Advance all cloth by a control step, over ``(num_envs, threads)``; failed environments keep their state."""
-    e, _ = wp.tid()
+    """Advance the cloth of an environment by a control step, unless it has failed."""
     if failure[e] != 0:
         return
     thread = thread_of_block()
@@ -318,6 +390,15 @@ def advance_cloth(
                 for k in range(p.color_start[color] + thread, p.color_start[color + 1], threads):
                     project_edge(p, c, fabric, s, w, e, r, k, sweep == 0)
                 sync_block()
+        if self_collision:
+            if step % c.look_every == 0:
+                search_all_selves(p, c, s, w, contacts, e, thread, threads)
+            for i in range(thread, vertices, threads):
+                push_self(p, c, fabric, s, w, contacts, e, i)
+            sync_block()
+            for i in range(thread, vertices, threads):
+                apply_self(p, c, fabric, w, contacts, e, i)
+            sync_block()
         for i in range(thread, vertices, threads):
             if int_at(p.held, i) < 0:
                 touch(p, c, fabric, o, boundaries, s, w, touches, e, i, step)
@@ -334,3 +415,33 @@ def advance_cloth(
         book(o, e, p.held_triangle[h], p.held_weights[h], z, w.held_impulse[e, h], w.held_moment[e, h])
     if not finite:
         wp.atomic_or(failure, e, failure_bit)
+
+
+@cache
+def advance_kernel(self_collision: bool) -> wp.Kernel:
+    """Return :func:`advance` as a kernel over ``(num_envs, threads)``, created on first use."""
+
+    @wp.kernel(
+        name="advance_cloth_apart" if self_collision else "advance_cloth",
+        module="unique",
+        launch_bounds=(THREADS, BLOCKS),
+        module_options={"enable_backward": False, "max_unroll": 0, "default_grid_stride": False, "fast_math": True},
+    )
+    def advance_cloth(
+        p: Pattern,
+        c: Constants,
+        fabric: Fabrics,
+        boundaries: Boundaries,
+        failure_bit: int,
+        # in and out
+        o: Obstacles,
+        s: ClothState,
+        w: Workspace,
+        touches: Touches,
+        contacts: SelfContacts,
+        failure: wp.array(dtype=int),
+    ):
+        e, _ = wp.tid()
+        advance(p, c, fabric, boundaries, failure_bit, o, s, w, touches, contacts, failure, e, self_collision)
+
+    return advance_cloth

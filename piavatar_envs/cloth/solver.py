@@ -9,17 +9,16 @@ import warp as wp
 
 from piavatar_envs.cloth.contact import Touches
 from piavatar_envs.cloth.garment import NO_WEARER, Garment
-from piavatar_envs.cloth.kernels import Constants, Pattern, Workspace, advance_cloth
+from piavatar_envs.cloth.kernels import THREADS, Constants, Pattern, Workspace, advance_kernel
 from piavatar_envs.cloth.mesh import joined
 from piavatar_envs.cloth.obstacles import Obstacles
+from piavatar_envs.cloth.self_contact import allocate_self_contacts
 from piavatar_envs.cloth.types import ClothSettings, ClothState, Fabrics
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
 from piavatar_envs.mpm.colliders import make_boundaries
 from piavatar_envs.mpm.types import FAILURE_CLOTH, Boundaries
 
-#: Threads of an environment on a GPU: a CUDA block, of one size, because a module is compiled for each size.
-THREADS = 256
 #: Arrays of :class:`~piavatar_envs.cloth.types.Fabrics`, by the attributes of a fabric.
 FABRIC_FIELDS = ("areal_density", "stretch", "bending", "friction", "drag", "skin_drag")
 
@@ -90,6 +89,8 @@ class Cloth:
         self.length = self._pattern.length
         self._constants = self._make_constants(gravity)
         self._workspace, self._touches = self._allocate()
+        enabled = self.settings.self_collision
+        self._self_contacts = allocate_self_contacts(self.mesh, num_envs, device, enabled)
 
     def record_step(self, graph: LaunchGraph, failure: wp.array, failure_bit: int = FAILURE_CLOTH) -> None:
         """Append the launch that advances the cloth by a control step.
@@ -103,8 +104,9 @@ class Cloth:
         """
         threads = self.threads
         inputs = [self._pattern, self._constants, self.fabric, self._boundaries, failure_bit]
-        changed = [self._obstacles, self.state, self._workspace, self._touches, failure]
-        graph.launch(advance_cloth, (self.num_envs, threads), inputs, changed, block_dim=threads)
+        changed = [self._obstacles, self.state, self._workspace, self._touches, self._self_contacts, failure]
+        kernel = advance_kernel(self.settings.self_collision)
+        graph.launch(kernel, (self.num_envs, threads), inputs, changed, block_dim=threads)
 
     @property
     def threads(self) -> int:
