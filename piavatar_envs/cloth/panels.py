@@ -8,8 +8,10 @@ borders along themselves. What the smoothing took inwards comes out of the skin 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -30,10 +32,61 @@ _COLLAR, _TILT, _WIDTH = 0.12, 0.45, 0.5
 _SHARES = 0.63, -0.65
 #: Passes along the coarse mesh, which make its edges even.
 _EVENING = 12
+#: Fewest vertices of a piece of skin.
+_FEWEST = 20
+#: Length of a border over the height of the wearer, below which it is a hole and no hem.
+_HOLE = 0.06
 #: Shortest edge that stays, over the wanted length.
-_SHORTEST = 0.6
+SHORTEST = 0.6
 #: Turns of edges in which a mesh is made of better triangles, over the number of its edges.
 _MOST_FLIPS = 10
+#: Sum of two angles from which an edge between them is turned.
+_FLAT = math.pi + 1.0e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A surface with borders.
+
+    Attributes:
+        faces: triangles, shape ``(T, 3)``; all vertices up to the highest have one.
+    """
+
+    faces: np.ndarray
+
+    @cached_property
+    def loops(self) -> list[np.ndarray]:
+        """Borders, each a loop of vertices."""
+        return boundary_loops(self.faces)
+
+    @cached_property
+    def rim(self) -> np.ndarray:
+        """Whether each vertex is on a border, shape ``(V,)`` bool."""
+        rim = np.zeros(int(self.faces.max()) + 1, bool)
+        for loop in self.loops:
+            rim[loop] = True
+        return rim
+
+    @cached_property
+    def beside(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices before and after each on its border, itself elsewhere, both shape ``(V,)``."""
+        before, after = np.arange(len(self.rim)), np.arange(len(self.rim))
+        for loop in self.loops:
+            before[loop], after[loop] = np.roll(loop, 1), np.roll(loop, -1)
+        return before, after
+
+    @cached_property
+    def mean(self) -> sparse.csr_array:
+        """The matrix that takes the mean of each vertex's neighbors; on a border, of those along it."""
+        count = len(self.rim)
+        links = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]])
+        near = sparse.coo_array((np.ones(len(links)), links.T), shape=(count, count)).tocsr()
+        both = sparse.diags_array((~self.rim).astype(np.float64)) @ ((near + near.T) > 0).astype(np.float64)
+        if self.loops:
+            start, end = np.concatenate(self.loops), np.concatenate([np.roll(loop, -1) for loop in self.loops])
+            along = sparse.coo_array((np.ones(len(start)), (start, end)), shape=near.shape).tocsr()
+            both = both + ((along + along.T) > 0).astype(np.float64)
+        return (sparse.diags_array(1.0 / np.maximum(both.sum(axis=1), 1.0)) @ both).tocsr()
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,17 +95,20 @@ class Panel:
 
     Attributes:
         blend: shares of the skin's vertices in those of the piece, rows sum to one, shape ``(W, V)``.
-        rows: triangles of the piece, shape ``(U, 3)``.
-        rim: whether a vertex is on a border of the piece, shape ``(W,)`` bool.
+        piece: of the skin, ``W`` vertices.
         keep: vertices of the piece that are those of the garment, shape ``(N,)``.
-        faces: triangles of the garment, shape ``(T, 3)`` int32.
+        cloth: the garment, ``N`` vertices.
     """
 
     blend: sparse.csr_array
-    rows: np.ndarray
-    rim: np.ndarray
+    piece: Sheet
     keep: np.ndarray
-    faces: np.ndarray
+    cloth: Sheet
+
+    @property
+    def faces(self) -> np.ndarray:
+        """Triangles of the garment, shape ``(T, 3)`` int32."""
+        return self.cloth.faces
 
     @property
     def anchors(self) -> sparse.csr_array:
@@ -79,34 +135,38 @@ def lay_out(wearer: Wearer, field: np.ndarray, ease: Ease, gap: float, edge: flo
     triangles = triangles[inside[triangles].all(axis=1)]
     triangles = _largest(triangles, blend.shape[0])
     used, rows = np.unique(triangles, return_inverse=True)
-    if len(used) < 20:
-        raise ValueError("nothing of the body is inside of the garment's seams; lengthen it")
-    blend, rows = blend[used].tocsr(), rows.reshape(-1, 3)
-    rim = np.zeros(len(used), bool)
-    for loop in boundary_loops(rows):
-        rim[loop] = True
-    points = _laid(wearer, blend, rows, rim, ease, gap, smoothing)
-    area = 0.5 * np.linalg.norm(np.cross(*_sides(points, rows)), axis=1).sum()
-    count = max(int(area / (ROW * edge**2)), 12)
-    found = remesh(points, rows, min(count, len(used)), first=boundary_loops(rows), spacing=edge)
-    faces = _without_notches(found.faces, rim[found.keep])
-    panel = Panel(blend, rows, rim, found.keep, flipped(points[found.keep], faces))
-    placed = laid(wearer, panel, ease, gap, smoothing)
-    there, faces = without_short(placed, panel.faces, _SHORTEST * edge)
-    panel = replace(panel, keep=panel.keep[there], faces=faces)
-    return replace(panel, faces=flipped(laid(wearer, panel, ease, gap, smoothing), faces))
+    blend, piece = blend[used].tocsr(), Sheet(rows.reshape(-1, 3))
+    if len(used) < _FEWEST or not piece.loops:
+        raise ValueError("nothing of the body is inside of the garment's seams, or all of it; change where they are")
+    piece = _without_holes(piece, blend @ wearer.vertices, _HOLE * float(np.ptp(wearer.vertices[:, 2])))
+    points = _laid(wearer, blend, piece, ease, gap, smoothing)
+    area = 0.5 * np.linalg.norm(np.cross(*_sides(points, piece.faces)), axis=1).sum()
+    least = sum(max(3, round(_around(points[loop]) / edge)) for loop in piece.loops)
+    count = min(max(int(area / (ROW * edge**2)), least + 4, 12), len(used))
+    found = remesh(points, piece.faces, count, first=piece.loops, spacing=edge)
+    faces = _without_notches(found.faces, piece.rim[found.keep])
+    panel = Panel(blend, piece, found.keep, Sheet(flipped(points[found.keep], faces)))
+    there, faces = without_short(_evened(wearer, panel, points, gap), panel.faces, SHORTEST * edge)
+    panel = replace(panel, keep=panel.keep[there], cloth=Sheet(faces))
+    return replace(panel, cloth=Sheet(flipped(_evened(wearer, panel, points, gap), faces)))
 
 
 def laid(wearer: Wearer, panel: Panel, ease: Ease, gap: float, smoothing: int) -> np.ndarray:
     """Return the vertices of a garment on a wearer [m], shape ``(N, 3)``; arguments as of :func:`lay_out`."""
-    points = _laid(wearer, panel.blend, panel.rows, panel.rim, ease, gap, smoothing)[panel.keep]
-    border = np.zeros(len(points), bool)
-    for loop in boundary_loops(panel.faces):
-        border[loop] = True
-    mean = _means(panel.faces, border)
+    return _evened(wearer, panel, _laid(wearer, panel.blend, panel.piece, ease, gap, smoothing), gap)
+
+
+def _evened(wearer: Wearer, panel: Panel, points: np.ndarray, gap: float) -> np.ndarray:
+    """Return the vertices of a garment on its piece of skin, moved along it for even edges [m], ``(N, 3)``."""
+    points = points[panel.keep]
+    before, after = panel.cloth.beside
     for _ in range(_EVENING):
-        way, normals = mean @ points - points, vertex_normals(points, panel.faces)
-        points = points + 0.5 * (way - np.einsum("nd,nd->n", way, normals)[:, None] * normals)
+        way, normals = panel.cloth.mean @ points - points, vertex_normals(points, panel.faces)
+        tangent = points[after] - points[before]  # of a border, which is to keep its place; zero elsewhere
+        tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1.0e-9)
+        inside = way - np.einsum("nd,nd->n", way, normals)[:, None] * normals
+        along = np.einsum("nd,nd->n", way, tangent)[:, None] * tangent
+        points = points + 0.5 * np.where(panel.cloth.rim[:, None], along, inside)
     return wearer.outside(points, gap)
 
 
@@ -158,36 +218,31 @@ def below_neck(wearer: Wearer, depth: float) -> np.ndarray:
     return np.where(wearer.turned_by("head") > 0.5, -1.0, field)
 
 
-def _laid(
-    wearer: Wearer, blend: sparse.csr_array, rows: np.ndarray, rim: np.ndarray, ease: Ease, gap: float, smoothing: int
-) -> np.ndarray:
+def _laid(wearer: Wearer, blend: sparse.csr_array, piece: Sheet, ease: Ease, gap: float, smoothing: int) -> np.ndarray:
     """Return the vertices of a piece of skin, eased outwards and smoothed [m], shape ``(W, 3)``."""
     points = blend @ wearer.vertices
-    normals = vertex_normals(points, rows)
-    points = points + ease(wearer, blend, points, normals)
-    mean = _means(rows, rim)
+    points = points + ease(wearer, blend, points, vertex_normals(points, piece.faces))
     for step in range(smoothing):
         for share in _SHARES:
-            points = points + share * (mean @ points - points)
+            points = points + share * (piece.mean @ points - points)
         if step % 8 == 7:
             points = wearer.outside(points, gap)
     return wearer.outside(points, gap)
 
 
-def _means(faces: np.ndarray, rim: np.ndarray) -> sparse.csr_array:
-    """Return the matrix that takes the mean of each vertex's neighbors; on a border, of those along it."""
-    links = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    near = sparse.coo_array((np.ones(len(links)), links.T), shape=(len(rim), len(rim))).tocsr()
-    near = ((near + near.T) > 0).astype(np.float64)
-    border = sparse.csr_array((len(rim), len(rim)))
-    loops = boundary_loops(faces)
-    if loops:
-        start, end = np.concatenate(loops), np.concatenate([np.roll(loop, -1) for loop in loops])
-        border = sparse.coo_array((np.ones(len(start)), (start, end)), shape=near.shape).tocsr()
-        border = ((border + border.T) > 0).astype(np.float64)
-    inner = sparse.diags_array((~rim).astype(np.float64)) @ near
-    both = (inner + sparse.diags_array(rim.astype(np.float64)) @ border).tocsr()
-    return sparse.diags_array(1.0 / np.maximum(both.sum(axis=1), 1.0)) @ both
+def _around(points: np.ndarray) -> float:
+    """Return the length of a closed line [m]."""
+    return float(np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1).sum())
+
+
+def _without_holes(piece: Sheet, points: np.ndarray, least: float) -> Sheet:
+    """Return a surface with fans over the borders that are shorter than a length [m]."""
+    fans = []
+    for loop in piece.loops:
+        if _around(points[loop]) < least:
+            around = loop[::-1]  # against the edges of the triangles beside it
+            fans += [(around[0], around[k], around[k + 1]) for k in range(1, len(around) - 1)]
+    return Sheet(np.concatenate([piece.faces, np.array(fans, piece.faces.dtype).reshape(-1, 3)])) if fans else piece
 
 
 def _without_notches(faces: np.ndarray, rim: np.ndarray) -> np.ndarray:
@@ -245,7 +300,7 @@ def flipped(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Such edges are those that are not of the intrinsic Delaunay triangulation (Bobenko & Springborn, "A discrete
     Laplace-Beltrami operator for simplicial surfaces", 2007), which has the largest least angles.
     """
-    triangles = [tuple(face) for face in faces.tolist()]
+    places, triangles = points.tolist(), [tuple(face) for face in faces.tolist()]
     beside = {(t[k], t[(k + 1) % 3]): index for index, t in enumerate(triangles) for k in range(3)}
     queue = [edge for edge in beside if edge[0] < edge[1]]
     for _ in range(_MOST_FLIPS * len(queue)):
@@ -256,8 +311,8 @@ def flipped(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         if one is None or two is None:
             continue
         c, d = (next(v for v in triangles[index] if v not in (a, b)) for index in (one, two))
-        taken = (c, d) in beside or (d, c) in beside
-        if taken or _angle(points, c, a, b) + _angle(points, d, a, b) <= np.pi + 1.0e-6:
+        taken = c == d or (c, d) in beside or (d, c) in beside
+        if taken or _angle(places[c], places[a], places[b]) + _angle(places[d], places[a], places[b]) <= _FLAT:
             continue
         del beside[a, b], beside[b, a]
         triangles[one], triangles[two] = (c, a, d), (d, b, c)
@@ -268,10 +323,11 @@ def flipped(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.array(triangles, faces.dtype)
 
 
-def _angle(points: np.ndarray, at: int, first: int, second: int) -> float:
-    """Return the angle at a vertex between two others."""
-    a, b = points[first] - points[at], points[second] - points[at]
-    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+def _angle(at: list[float], first: list[float], second: list[float]) -> float:
+    """Return the angle at a point between two others."""
+    a, b = [x - y for x, y in zip(first, at, strict=True)], [x - y for x, y in zip(second, at, strict=True)]
+    cross = math.hypot(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return math.atan2(cross, a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _largest(triangles: np.ndarray, count: int) -> np.ndarray:

@@ -170,7 +170,8 @@ def _close(faces: np.ndarray, borders: int) -> np.ndarray:
     """Return the triangles and fans over small holes, but not over those between the first vertices, the borders."""
     fans = []
     for loop in boundary_loops(faces):
-        if 3 <= len(loop) <= _WIDEST_HOLE and not (loop < borders).all():
+        of_border = np.count_nonzero(loop < borders)  # a border may have a vertex more that has come to lie on it
+        if 3 <= len(loop) <= _WIDEST_HOLE and (2 * of_border <= len(loop) or of_border < len(loop) <= 4):
             around = loop[::-1]  # the hole's edges run against those of its triangles
             fans += [[around[0], around[k], around[k + 1]] for k in range(1, len(loop) - 1)]
     return np.array(_oriented(faces.tolist(), fans), faces.dtype)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,8 @@ from piavatar_envs.cloth.wearer import Wearer
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.result_cache import digest_of, kept
 
+#: Distance between garments that lie over each other, which do not touch [m].
+LAYER = 0.004
 #: Greatest speed of a vertex of a draped garment [m/s].
 AT_REST = 0.002
 #: Control step of the drape and its longest time [s], share of the velocity that is lost in a substep, and number of
@@ -56,6 +58,7 @@ def make_garment(
     parameters: Sequence[float] | np.ndarray,
     piece: int = 0,
     grading: bool = False,
+    layer: int = 0,
 ) -> Garment:
     """Return a garment of a kind, draped on a shape of a body in its rest pose.
 
@@ -67,6 +70,7 @@ def make_garment(
         parameters: of its shape, ``(S,)``; with grading, those around which shapes are drawn.
         piece: of the obstacles that wears it.
         grading: whether to find the changes of its positions with the shape.
+        layer: number of garments beneath it, over which it lies.
 
     Raises:
         ValueError: the settings are refused, or the garment does not fit the body.
@@ -74,7 +78,7 @@ def make_garment(
     parameters = np.asarray(parameters, np.float64)
 
     def compute() -> dict[str, np.ndarray]:
-        return _made(kind, settings, fabric, asset, parameters, grading)
+        return _made(kind, settings, fabric, asset, parameters, grading, layer)
 
     source = sys.modules[cutter(kind).__module__]
     if getattr(source, "__file__", None) is None:  # code without a file has no digest
@@ -82,8 +86,8 @@ def make_garment(
     else:
         body = [asset.vertices, asset.faces, asset.skin_joints, asset.skin_weights, asset.shape_deltas]
         given = [kind, *(_content(item) for item in sorted(settings.items()))]
-        digest = digest_of([body, given, fabric, parameters, grading], [*_CODE, sys.modules[__name__], source])
-        arrays = kept("garment", digest, compute, f"draping a {kind} on {asset.name}")
+        digest = digest_of([body, given, fabric, parameters, grading, layer], [*_CODE, sys.modules[__name__], source])
+        arrays = kept("garment", digest, compute, f"draping {kind} on {asset.name}")
     names = [field.name for field in fields(ClothMesh) if field.name != "num_vertices"]
     return Garment(
         kind=kind,
@@ -108,11 +112,18 @@ def _content(item: tuple[str, Any]) -> list[Any]:
 
 
 def _made(
-    kind: str, settings: Mapping[str, Any], fabric: Fabric, asset: AvatarAsset, parameters: np.ndarray, grading: bool
+    kind: str,
+    settings: Mapping[str, Any],
+    fabric: Fabric,
+    asset: AvatarAsset,
+    parameters: np.ndarray,
+    grading: bool,
+    layer: int,
 ) -> dict[str, np.ndarray]:
     """Return the arrays of a garment."""
     wearer = Wearer.of(asset, parameters)
     cut = cut_garment(kind, wearer, settings)
+    cut = replace(cut, thickness=cut.thickness + layer * LAYER)
     mesh, proxy = ClothMesh.build(cut.faces, cut.measure), proxy_of(asset)
     held = held_by(wearer, proxy, cut)
     start = wearer.outside(cut.positions, cut.thickness)
@@ -164,14 +175,17 @@ def drape(garment: Garment, wearer: Wearer, proxy: Proxy, longest: float = _LONG
     cloth = Cloth([garment], still(wearer, proxy), None, settings, num_envs=1, control_dt=_STEP, device="cpu")
     failure, graph = wp.zeros(1, dtype=int, device="cpu"), LaunchGraph("cpu")
     cloth.record_step(graph, failure)
-    slow = 0
+    slow, again = 0, True
     for _ in range(round(longest / _STEP)):
         graph.run()
         if failure.numpy()[0]:
             raise ValueError(f"the {garment.kind} tears in the drape; change its settings, or length of edges")
         slow = slow + 1 if np.linalg.norm(cloth.state.v.numpy()[0], axis=1).max() < AT_REST else 0
-        if slow == _SLOW:
+        if slow == _SLOW and not again:
             break
+        if slow == _SLOW:  # as after a reset: without the places of the skin that were nearest before
+            cloth.state.near.fill_(-1)
+            slow, again = 0, False
     return cloth.state.x.numpy()[0].astype(np.float64)
 
 

@@ -99,15 +99,15 @@ class Wearer:
             points: shape ``(N, 3)`` [m].
             gap: the distance, of all or of each [m].
         """
-        points = np.array(points, np.float64)
+        points, low = np.array(points, np.float64), np.arange(len(points))
         gap = np.broadcast_to(gap, len(points))
         for _ in range(_STEPS):
-            distance, face, coordinates = self.surface.query(points)
-            low = np.flatnonzero(distance < gap - 1.0e-5)
-            if not len(low):
+            distance, face, coordinates = self.surface.query(points[low])
+            near = distance < gap[low] - 1.0e-5
+            if not near.any():
                 break
-            corners = self.faces[face[low]]
-            normals = np.einsum("nc,ncd->nd", coordinates[low], self.normals[corners])
+            low, short = low[near], (gap[low] - distance)[near]
+            normals = np.einsum("nc,ncd->nd", coordinates[near], self.normals[self.faces[face[near]]])
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1.0e-12)
-            points[low] += np.minimum(gap[low] - distance[low], _LONGEST)[:, None] * normals
+            points[low] += np.minimum(short, _LONGEST)[:, None] * normals
         return points

@@ -60,8 +60,8 @@ def tailor(config: EnvConfig, flesh: Sequence[Flesh]) -> list[Garment]:
 
     garments = []
     for index, own in enumerate(flesh):
-        for given in worn_by(config, own):
-            wearer = own.asset, own.base_parameters, index, own.shape.randomize
+        for layer, given in enumerate(worn_by(config, own)):
+            wearer = own.asset, own.base_parameters, index, own.shape.randomize, layer
             try:
                 garments.append(make_garment(given.kind, given.settings, given.cloth, *wearer))
             except (OSError, TypeError, ValueError) as error:

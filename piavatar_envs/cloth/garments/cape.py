@@ -9,7 +9,7 @@ from pydantic import Field
 
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.pattern import Belt, Sector
-from piavatar_envs.cloth.proxy import LEFT_ARM, LEFT_LEG, RIGHT_ARM, RIGHT_LEG, TRUNK
+from piavatar_envs.cloth.proxy import LEFT_ARM, LEFT_FOOT, LEFT_LEG, RIGHT_ARM, RIGHT_FOOT, RIGHT_LEG, TRUNK
 from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance of the upper edge from the hull of the shoulders [m].
@@ -52,7 +52,9 @@ def cut(
         own = _belt(other)
         return panel.hung(own, _to_ankles(other, own) / start)
 
-    sees = np.full(len(panel.polar), TRUNK | LEFT_ARM | RIGHT_ARM | LEFT_LEG | RIGHT_LEG, np.int32)
+    sees = np.full(
+        len(panel.polar), TRUNK | LEFT_ARM | RIGHT_ARM | LEFT_LEG | RIGHT_LEG | LEFT_FOOT | RIGHT_FOOT, np.int32
+    )
     return Cut(fit(wearer), panel.faces, sees, panel.rows[0], panel.lengths, fit)
 
 

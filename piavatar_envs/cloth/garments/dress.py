@@ -11,7 +11,7 @@ from piavatar_envs.cloth.bodice import cut_bodice
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.garments.skirt import to_knees, waist_belt
 from piavatar_envs.cloth.pattern import Sector
-from piavatar_envs.cloth.proxy import LEFT_LEG, RIGHT_LEG, TRUNK
+from piavatar_envs.cloth.proxy import LEFT_FOOT, LEFT_LEG, RIGHT_FOOT, RIGHT_LEG, TRUNK
 from piavatar_envs.cloth.remesh import boundary_loops
 from piavatar_envs.cloth.wearer import Wearer
 
@@ -19,6 +19,8 @@ from piavatar_envs.cloth.wearer import Wearer
 THICKNESS, _LOOSE = 0.005, 0.004
 #: Length of a dress without one from the waist down, over the way from there to the knees.
 _TO_KNEES = 1.0
+#: Passes that make the steps between the vertices of the waist even.
+_EVENING = 20
 
 
 def cut(
@@ -63,6 +65,11 @@ def cut(
     waist = min(boundary_loops(upper), key=lambda loop: above[loop, 2].mean())
     angle = belt.angle(above[waist])
     waist, angle = waist[np.argsort(angle)], np.sort(angle)
+    for _ in range(_EVENING):  # even steps around the belt
+        before, after = np.roll(angle, 1), np.roll(angle, -1)
+        before[0] -= 2.0 * np.pi
+        after[-1] += 2.0 * np.pi
+        angle = 0.5 * angle + 0.25 * (before + after)
     panel = Sector.around(belt.length, length, flare, edge, angle)
     number = np.concatenate([waist, len(above) + np.arange(len(panel.polar) - len(waist))])
     place = np.full(len(above) + len(panel.polar) - len(waist), -1)  # in the panel
@@ -82,6 +89,7 @@ def cut(
         straight[flat] = panel.lengths(place[pairs[flat]])
         return straight
 
-    sees = np.concatenate([bodice.sees, np.full(len(place) - len(above), TRUNK | LEFT_LEG | RIGHT_LEG, np.int32)])
+    legs = np.full(len(place) - len(above), TRUNK | LEFT_LEG | RIGHT_LEG | LEFT_FOOT | RIGHT_FOOT, np.int32)
+    sees = np.concatenate([bodice.sees, legs])
     faces = np.concatenate([upper, number[panel.faces]]).astype(np.int32)
     return Cut(positions, faces, sees, waist.astype(np.int32), lengths, fit, THICKNESS)

@@ -10,9 +10,10 @@ from pydantic import Field
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from piavatar_envs.avatar.body.asset import area_vectors
 from piavatar_envs.avatar.body.sources.mesh import Y_UP, load_surface
 from piavatar_envs.cloth.cut import Cut
-from piavatar_envs.cloth.panels import flipped
+from piavatar_envs.cloth.panels import SHORTEST, flipped, without_short
 from piavatar_envs.cloth.pattern import ROW
 from piavatar_envs.cloth.proxy import ALL_PARTS, LEFT_HAND, RIGHT_HAND
 from piavatar_envs.cloth.remesh import boundary_loops, remesh
@@ -22,6 +23,10 @@ from piavatar_envs.cloth.wearer import Wearer
 THICKNESS, _WELD = 0.005, 1.0e-5
 #: Area of a piece over that of all, from which it is cloth and no button.
 _LEAST_PIECE = 0.05
+#: Distance from the body of the nearest vertex, and of any [m].
+_FARTHEST, _WIDEST = 0.1, 2.0
+#: Fewest vertices within its borders.
+_FEWEST = 12
 #: Number of vertices over that of the wanted edges, from which a file is meshed anew.
 _TOO_FINE = 1.3
 
@@ -65,31 +70,24 @@ def cut(
         upright = upright @ Y_UP.T
     points, faces = _welded(upright * scale + np.array(offset), loaded.faces)
     points, faces = _pieces(points, faces)
+    _check_place(file.name, wearer, points)
     faces = _oriented(wearer, points, faces)
-    area = (
-        0.5
-        * np.linalg.norm(
-            np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]), axis=1
-        ).sum()
-    )
-    count = max(int(area / (ROW * edge**2)), 12)
-    if len(points) > _TOO_FINE * count:
-        found = remesh(points, faces, count, first=boundary_loops(faces), spacing=edge)
+    loops = boundary_loops(faces)
+    if held == "top" and not loops:
+        raise ValueError(f"{file.name} has no border that could be held; set held='none', or open the surface")
+    count = int(np.linalg.norm(area_vectors(points, faces), axis=1).sum() / (ROW * edge**2))
+    if len(points) > _TOO_FINE * max(count, _FEWEST):
+        around = [np.linalg.norm(np.diff(points[loop], axis=0), axis=1).sum() for loop in loops]
+        border = sum(max(3, round(length / edge)) for length in around)
+        count = min(max(count, border + _FEWEST), len(points))
+        found = remesh(points, faces, count, first=loops, spacing=edge)
         points = points[found.keep]
-        faces = flipped(points, found.faces)
-    apart = wearer.surface.distance(points)
-    if np.abs(apart).min() > 0.1 or (apart < -0.1).mean() > 0.5:
-        raise ValueError(
-            f"{file.name} is not around the body: it reaches from {_shown(points.min(axis=0))} to "
-            f"{_shown(points.max(axis=0))} m, the body from {_shown(wearer.vertices.min(axis=0))} to "
-            f"{_shown(wearer.vertices.max(axis=0))}; give scale, offset or up"
-        )
+        there, faces = without_short(points, flipped(points, found.faces), SHORTEST * edge)
+        points = points[there]
+        faces = flipped(points, faces)
     top = np.zeros(0, np.int32)
     if held == "top":
-        loops = [loop for loop in boundary_loops(faces) if len(loop) > 3]
-        if not loops:
-            raise ValueError(f"{file.name} has no border that could be held; set held='none', or open the surface")
-        top = max(loops, key=lambda loop: points[loop, 2].mean()).astype(np.int32)
+        top = max(boundary_loops(faces), key=lambda loop: points[loop, 2].mean()).astype(np.int32)
     sees = np.full(len(points), ALL_PARTS & ~(LEFT_HAND | RIGHT_HAND), np.int32)
     shape = points.copy()
 
@@ -97,6 +95,21 @@ def cut(
         return np.linalg.norm(shape[pairs[:, 0]] - shape[pairs[:, 1]], axis=1)
 
     return Cut(wearer.outside(points, THICKNESS), faces, sees, top, lengths, None, THICKNESS)
+
+
+def _check_place(name: str, wearer: Wearer, points: np.ndarray) -> None:
+    """Refuse a surface that is not around the body.
+
+    Raises:
+        ValueError: it is such.
+    """
+    apart = wearer.surface.distance(points)
+    if np.abs(apart).min() > _FARTHEST or (apart < -_FARTHEST).mean() > 0.5 or apart.max() > _WIDEST:
+        spans = [[_shown(each.min(axis=0)), _shown(each.max(axis=0))] for each in (points, wearer.vertices)]
+        raise ValueError(
+            f"{name} is not around the body: it reaches from {spans[0][0]} to {spans[0][1]} m, the body from "
+            f"{spans[1][0]} to {spans[1][1]}; give scale, offset or up"
+        )
 
 
 def _shown(point: np.ndarray) -> list[float]:

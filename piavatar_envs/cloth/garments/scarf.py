@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.pattern import ROW, between
-from piavatar_envs.cloth.proxy import HEAD, LEFT_LEG, RIGHT_LEG, TRUNK
+from piavatar_envs.cloth.proxy import HEAD, LEFT_FOOT, LEFT_LEG, RIGHT_FOOT, RIGHT_LEG, TRUNK
 from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance from the skin at which a scarf is laid, and its thickness [m].
@@ -54,7 +54,7 @@ def cut(
         first, second = pairs.T
         return np.hypot(along[first] - along[second], across[first] - across[second])
 
-    sees = np.full(len(along), TRUNK | HEAD | LEFT_LEG | RIGHT_LEG, np.int32)
+    sees = np.full(len(along), TRUNK | HEAD | LEFT_LEG | RIGHT_LEG | LEFT_FOOT | RIGHT_FOOT, np.int32)
     held = np.flatnonzero((np.abs(along) < _HELD) & (np.abs(across) < _HELD)).astype(np.int32)
     return Cut(fit(wearer), faces, sees, held, lengths, fit, THICKNESS)
 
@@ -71,7 +71,7 @@ def _rectangle(length: float, width: float, edge: float) -> tuple[np.ndarray, np
         across.append(np.full(len(steps), 0.5 * width - width * index / rows))
     flat = np.concatenate(along)
     faces = np.concatenate([between(upper, lower, flat, closed=False) for upper, lower in pairwise(row)])
-    return flat, np.concatenate(across), faces
+    return flat, np.concatenate(across), np.ascontiguousarray(faces[:, ::-1])
 
 
 def _placed(wearer: Wearer, along: np.ndarray, across: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.pattern import Belt, Sector
-from piavatar_envs.cloth.proxy import LEFT_LEG, RIGHT_LEG, TRUNK
+from piavatar_envs.cloth.proxy import LEFT_FOOT, LEFT_LEG, RIGHT_FOOT, RIGHT_LEG, TRUNK
 from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance of a waistband from the hull of the body [m].
@@ -53,7 +53,7 @@ def cut(
         own = waist_belt(other, rise)
         return panel.hung(own, to_knees(other, own.height) / start)
 
-    sees = np.full(len(panel.polar), TRUNK | LEFT_LEG | RIGHT_LEG, np.int32)
+    sees = np.full(len(panel.polar), TRUNK | LEFT_LEG | RIGHT_LEG | LEFT_FOOT | RIGHT_FOOT, np.int32)
     return Cut(panel.hung(belt), panel.faces, sees, panel.rows[0], panel.lengths, fit)
 
 

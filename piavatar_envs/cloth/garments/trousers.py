@@ -10,7 +10,7 @@ from scipy import sparse
 
 from piavatar_envs.cloth.cut import Cut
 from piavatar_envs.cloth.panels import along_limb, laid, lay_out, limb_field
-from piavatar_envs.cloth.proxy import LEFT_LEG, RIGHT_LEG, TRUNK
+from piavatar_envs.cloth.proxy import LEFT_FOOT, LEFT_LEG, RIGHT_FOOT, RIGHT_LEG, TRUNK
 from piavatar_envs.cloth.remesh import boundary_loops
 from piavatar_envs.cloth.wearer import Wearer
 
@@ -72,7 +72,8 @@ def cut(
 
     panel = lay_out(wearer, field, ease, THICKNESS, edge, _SMOOTHING)
     parts = [panel.anchors @ wearer.turned_by(joint) for joint in ("left_hip", "right_hip")]
-    sees = np.where(parts[0] > 0.5, LEFT_LEG, np.where(parts[1] > 0.5, RIGHT_LEG, TRUNK)).astype(np.int32)
+    left, right = LEFT_LEG | LEFT_FOOT, RIGHT_LEG | RIGHT_FOOT
+    sees = np.where(parts[0] > 0.5, left, np.where(parts[1] > 0.5, right, TRUNK)).astype(np.int32)
 
     def fit(other: Wearer) -> np.ndarray:
         return laid(other, panel, ease, THICKNESS, _SMOOTHING)
