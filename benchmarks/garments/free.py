@@ -156,9 +156,15 @@ def free(options: Options) -> Iterator[Quantity]:
         stretched = mesh.strain(run.get()) * mesh.length
         return 0.5 * (run.mass @ (run.get("v") ** 2).sum(axis=1)) + 0.5 * (stiffness @ stretched**2)
 
-    momentum, start = run.momentum()[0], energy()
+    def spin() -> float:
+        center = run.mass @ run.get() / run.mass.sum()
+        return float((np.cross(run.get() - center, run.mass[:, None] * run.get("v"))).sum(axis=0)[2])
+
+    momentum, start, turning = run.momentum()[0], energy(), spin()
     energies = [energy() for _ in range(60) if run.steps(1)]
     size = run.mass @ np.linalg.norm(v, axis=1)
     drift = np.abs(run.momentum()[0] - momentum).max() / size
     yield at_most("drift of momentum, of the sum of m |v|", drift, 1e-6, theory=0.0)
+    lost = 1.0 - theory.implicit_spin(4.0, 2.0, CONTROL_DT / run.cloth.settings.substeps) / 4.0
+    yield equal("angular momentum lost, by implicit steps", 1.0 - spin() / turning, lost, 0.2 * lost)
     yield at_most("greatest energy after the start, of that of the start", max(energies) / start, 1.0, theory=1.0)

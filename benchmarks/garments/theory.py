@@ -67,6 +67,20 @@ def peirce_angle(overhang: float, bending_length: float) -> float:
     return float(brentq(miss, 1e-6, 0.5 * np.pi - 1e-6))
 
 
+def implicit_spin(omega: float, time: float, step: float) -> float:
+    """Return what implicit Euler steps have left of the angular velocity [1/s] of a stiff free body after a time [s].
+
+    Constraints that hold at the end of a step turn it by ``tan b = sin a / (2 - cos a)`` after a step that turned it by
+    ``a``, hence ``b = a - a^3`` for small angles, and ``d omega / dt = -step omega^3``.
+
+    Args:
+        omega: at first [1/s].
+        time: [s].
+        step: [s].
+    """
+    return float(omega / np.sqrt(1.0 + 2.0 * step * omega**2 * time))
+
+
 def sliding_acceleration(angle: float, friction: float, gravity: float = 9.81) -> float:
     """Return the acceleration [m/s^2] of what slides down an incline of an angle [rad]; 0 below the friction angle."""
     return max(0.0, gravity * (np.sin(angle) - friction * np.cos(angle)))

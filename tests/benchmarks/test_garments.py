@@ -50,3 +50,7 @@ def test_theory():
     lost = (theory.slowed_speed(3.0, step, 0.2, 0.6) - 3.0) / step
     assert lost == pytest.approx(-0.6 / 0.2 * 9.0, rel=1e-4)
     assert theory.sliding_acceleration(0.2, 0.3) == 0.0
+    angle, step = 0.02, 0.005
+    for _ in range(400):
+        angle = np.arctan(np.sin(angle) / (2.0 - np.cos(angle)))
+    assert angle / step == pytest.approx(theory.implicit_spin(4.0, 2.0, step), rel=1e-2)
