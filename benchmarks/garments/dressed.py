@@ -20,7 +20,7 @@ from piavatar_envs.avatar.skin import Skin
 DEEP = 1e-3
 TRACK = "PIAvatar/TrackMotion-v0"
 #: TrackMotion without what disturbs the motion.
-UNDISTURBED = {"impulse": 0.0, "random_start": False, "fail_distance": 100.0, "episode_seconds": 3600.0}
+UNDISTURBED = {"impulse": 0.0, "random_start": False, "fail_distance": 100.0, "episode_seconds": 5.0}
 RATE = 30
 #: Spin of the flutter test: rest, acceleration, speed [rev/s], end of the spin, stop and rest [s].
 REST, RAMP, SPEED, SPUN, STOP, AFTER = 0.8, 0.5, 2.0, 2.0, 0.2, 1.3

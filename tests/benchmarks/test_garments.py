@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import runner
-from benchmarks.garments import theory
+from benchmarks.garments import theory, worn
 from benchmarks.garments.__main__ import cases
 from benchmarks.garments.picture import share
 from benchmarks.garments.rows import CHECKS, Options
@@ -54,3 +54,12 @@ def test_theory():
     for _ in range(400):
         angle = np.arctan(np.sin(angle) / (2.0 - np.cos(angle)))
     assert angle / step == pytest.approx(theory.implicit_spin(4.0, 2.0, step), rel=1e-2)
+
+
+def test_a_dressed_body_is_measured(device):
+    """Run a row with a body: what the cloth gives it is what it receives."""
+    rows = list(CHECKS["momentum"].measure(Options(fidelity="tiny", device=device)))
+    assert [row.verdict for row in rows] == ["holds", "holds"]
+    walking = worn.Dressed([worn.SKIRT], Options(fidelity="tiny", device=device), motion="deepmimic:walk", loop=True)
+    assert 0.0 <= worn.looks(walking, 0.2).max() < 0.05 and 0.0 < walking.strain() < 0.02
+    assert np.isfinite(walking.impulse()).all() and worn.bytes_of(walking) > 1e5
