@@ -342,8 +342,10 @@ def leapt() -> Script:
 def dresses() -> list[Act]:
     """Return acts of a body in a dress that spins and stops, and that jumps."""
     dress = GarmentConfig(kind="dress", fabric="cotton")
-    spin = View(eye=(0.9, -3.6, 1.25), target=(0.0, 0.0, 0.8), moments=(0.2, 0.6, 1.2, 1.9, 2.2, 2.5, 3.0))
-    leap = replace(spin, target=(0.0, 0.0, 0.95), moments=(0.3, 0.5667, 0.8, 1.0, 1.1333, 1.3, 1.9))
+    spin = View(eye=(1.1, -4.1, 1.3), target=(0.0, 0.0, 0.84), moments=(0.2, 0.6, 1.2, 1.9, 2.2, 2.5, 3.0))
+    leap = replace(
+        spin, eye=(1.3, -4.9, 1.3), target=(0.0, 0.0, 1.02), moments=(0.3, 0.5667, 0.8, 1.0, 1.1333, 1.3, 1.9)
+    )
     return [
         Act("spin in a dress", 3.2, garments=(dress,), script=spun(), view=spin, tags={"rev_s": SPIN_SPEED}),
         Act("jump in a dress", 2.4, garments=(dress,), script=leapt(), view=leap, tags={"rev_s": None}),
