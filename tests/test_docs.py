@@ -30,6 +30,7 @@ SMALLER = {
     'device="cuda"': "device=DEVICE",
     'Path("reach")': 'FOLDER / "reach"',
     'save("kick.png")': 'save(FOLDER / "kick.png")',
+    'save("reach.png")': 'save(FOLDER / "reach.png")',
 }
 
 
