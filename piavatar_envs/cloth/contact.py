@@ -192,7 +192,7 @@ def nearest_point(
     """
     at = int(-1)
     best = float(_FAR)
-    if before >= 0:  # noqa: SIM102 - Warp evaluates both sides of an `and`
+    if before >= 0 and before < o.part.shape[0]:  # noqa: SIM102 - a loaded state may hold anything, and both sides run
         if (o.part[before] & sees) != 0:
             near, distance = walk(o, e, share, x, before, sees)
             at = near

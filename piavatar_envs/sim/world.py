@@ -320,6 +320,10 @@ def record_control_step(
         props.record_tracking(graph, state)
     if garments:
         garments.record_end(graph)
+        # cloth has changed velocities
+        graph.parallel_for_each(avatars, lambda avatar, own: avatar.record_tracking(own, state))
+        if props:
+            props.record_tracking(graph, state)
     if forces:
         forces.record_end(graph, state)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from piavatar_envs.api.conformance import check_task
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import FAILURE_CLOTH, failure_name
 from piavatar_envs.sim.garments import bytes_of_garments
@@ -144,6 +145,24 @@ def test_factors_on_fabrics_are_observed(make_env):
     assert fabric.bending.numpy()[0, 0] == pytest.approx(stiffness * nominal.bending, rel=1e-6)
     assert fabric.friction.numpy()[0, 0] == pytest.approx(nominal.friction)
     assert "cloth_mass_factor" in names and "cloth_friction_factor" not in names
+
+
+def test_the_contract_of_environments_is_kept(device):
+    # a reset of one environment tracks all of them: what cloth has changed must have been tracked before
+    check_task(REACH, 8, device, **RANDOM, observe_parameters=True)
+
+
+def test_a_state_with_any_nearest_points_goes_on(make_batch):
+    batch = make_batch(REACH, 2, **WORN)
+    batch.reset(seeds=[0, 1])
+    state = batch.get_state()
+    state["cloth.near"][:] = np.random.default_rng(0).integers(-(2**31), 2**31, state["cloth.near"].shape)
+    batch.set_state(state)
+    batch.step()
+    points = batch.simulation.garments.surfaces.obstacles.part.shape[0]
+    free = batch.simulation.garments.cloth.mass[0] > 0.0  # held vertices have none
+    near = batch.get_state()["cloth.near"][:, free, 0]
+    assert (near >= -1).all() and (near < points).all() and not batch.failure.numpy().any()
 
 
 def test_cloth_that_is_not_finite_fails_its_environment_alone(make_batch):
