@@ -51,7 +51,7 @@ class SelfContacts:
 def allocate_self_contacts(mesh: ClothMesh, num_envs: int, device: str, enabled: bool) -> SelfContacts:
     """Allocate the workspace; without entries if it is not ``enabled``."""
     vertices = mesh.num_vertices if enabled else 0
-    buckets = 1 << (2 * vertices).bit_length() if enabled else 0
+    buckets = buckets_of(vertices) if enabled else 0
     shape = (num_envs, vertices)
     return fill(
         SelfContacts(),
@@ -63,6 +63,16 @@ def allocate_self_contacts(mesh: ClothMesh, num_envs: int, device: str, enabled:
         side=wp.zeros(shape, dtype=float, device=device),
         sums=wp.zeros((*shape, 3), dtype=wp.int64, device=device),
     )
+
+
+def buckets_of(vertices: int) -> int:
+    """Return the number of buckets for so many vertices, a power of two."""
+    return 1 << (2 * vertices).bit_length()
+
+
+def bytes_of_self_contact(mesh: ClothMesh) -> int:
+    """Return the memory of the workspace in an environment [bytes]."""
+    return mesh.num_vertices * (4 + 12 + 12 + 4 + 3 * 8) + 4 * buckets_of(mesh.num_vertices)
 
 
 @wp.func

@@ -10,9 +10,9 @@ import warp as wp
 from piavatar_envs.cloth.contact import Touches
 from piavatar_envs.cloth.garment import NO_WEARER, Garment
 from piavatar_envs.cloth.kernels import THREADS, Constants, Pattern, Workspace, advance_kernel
-from piavatar_envs.cloth.mesh import joined
+from piavatar_envs.cloth.mesh import ClothMesh, joined
 from piavatar_envs.cloth.obstacles import Obstacles
-from piavatar_envs.cloth.self_contact import allocate_self_contacts
+from piavatar_envs.cloth.self_contact import allocate_self_contacts, bytes_of_self_contact
 from piavatar_envs.cloth.types import ClothSettings, ClothState, Fabrics
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
@@ -213,6 +213,16 @@ class Cloth:
 
     def _vectors(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self.device)
+
+
+def bytes_of_cloth(mesh: ClothMesh, slots: int, self_collision: bool = False) -> int:
+    """Return the memory of a garment in an environment, with ``slots`` contacts a vertex [bytes].
+
+    Lengths of edges that differ by environment are included; the few held vertices are not.
+    """
+    state, motion, contact = 2 * 12 + 2 * 4, 2 * 12 + 4, 5 * 12 + 2 * 4 + 4
+    apart = bytes_of_self_contact(mesh) if self_collision else 0
+    return mesh.num_vertices * (state + motion + slots * contact) + 2 * 4 * mesh.num_edges + apart
 
 
 def first_faces(obstacles: Obstacles) -> np.ndarray:

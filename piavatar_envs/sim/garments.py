@@ -28,7 +28,7 @@ from piavatar_envs.cloth.mesh import ClothMesh
 from piavatar_envs.cloth.obstacles import ObstacleSurfaces, Piece, bytes_of_obstacles
 from piavatar_envs.cloth.proxy import ALL_PARTS, PROXY_VERTICES, proxy_of
 from piavatar_envs.cloth.remesh import remesh
-from piavatar_envs.cloth.solver import Cloth
+from piavatar_envs.cloth.solver import Cloth, bytes_of_cloth
 from piavatar_envs.cloth.types import ClothSettings, ClothState
 from piavatar_envs.config import ClothConfig, ConfigError, EnvConfig, GarmentConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -185,20 +185,23 @@ class _Worn:
         self.workspace = skin_workspace(self.surface, avatar.model.num_envs, device)
 
 
-def bytes_of_garments(meshes: Sequence[ClothMesh], flesh: Sequence[Flesh], points: Sequence[PropPoints]) -> int:
+def bytes_of_garments(
+    meshes: Sequence[ClothMesh], flesh: Sequence[Flesh], points: Sequence[PropPoints], self_collision: bool = False
+) -> int:
     """Estimate the memory of the garments of an environment and of what they touch [bytes]; 0 without garments.
 
     Args:
         meshes: of all garments.
         flesh: of all avatars.
         points: of all props.
+        self_collision: whether garments keep apart from each other.
     """
     if not meshes:
         return 0
     surface = len(flesh) * PROXY_VERTICES + sum(min(len(own.vertices), MOST_PROP_VERTICES) for own in points)
     skins = sum(skin_bytes(len(own.points.rest[0])) for own in flesh) + len(meshes) * skin_bytes(0)
     slots = 2 if len(flesh) + len(points) > 1 else 1
-    return bytes_of_obstacles(surface) + skins + sum(bytes_of_cloth(own, slots) for own in meshes)
+    return bytes_of_obstacles(surface) + skins + sum(bytes_of_cloth(own, slots, self_collision) for own in meshes)
 
 
 @wp.kernel
@@ -285,11 +288,6 @@ def prop_piece(column: int, props: PropSet, state: State) -> Piece:
 
     weights = _placed(solid.weights(), prop.first, model.num_particles)
     return Piece(vertices, faces, np.full(len(vertices), ALL_PARTS), weights, record)
-
-
-def bytes_of_cloth(mesh: ClothMesh, slots: int) -> int:
-    """Return the memory of a garment in an environment, with ``slots`` contacts a vertex [bytes]."""
-    return mesh.num_vertices * (5 * 12 + 3 * 4 + slots * (5 * 12 + 3 * 4)) + 8 * mesh.num_edges
 
 
 def _placed(weights: sparse.csr_array, first: int, num_particles: int) -> sparse.csr_array:

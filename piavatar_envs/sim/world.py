@@ -192,7 +192,9 @@ class Simulation:
             rest=rest,
             sound_speed=wave,
             limiting_speed=limiting,
-            more_bytes=bytes_of_garments([own.mesh for own in self._tailored], self.flesh, self._solids),
+            more_bytes=bytes_of_garments(
+                [own.mesh for own in self._tailored], self.flesh, self._solids, self.config.cloth.self_collision
+            ),
         )
         fields = self.model.contact.num_fields
         self.initial_colliders = make_boundaries(subjects.colliders, fields, self.num_envs, self.device)

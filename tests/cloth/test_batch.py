@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 from benchmarks.garments.sheets import LINEN, Run, flat_sheet, garment, hanging_sheet, move, sphere, surfaces
+from piavatar_envs.cloth.solver import bytes_of_cloth
 from piavatar_envs.mpm.colliders import Collider, make_boundaries
 from piavatar_envs.mpm.types import FAILURE_CLOTH
 from tests.gpu_on_cpu import gpu_on_cpu
@@ -88,3 +90,15 @@ def test_environments_may_have_their_own_fabric_and_lengths(device):
         long = [-run.get("x", e)[:, 2].min() / 0.2 for e in range(2)]
         assert long[0] == pytest.approx(1.0 + 0.2 * 9.81 * 0.2 / 40.0, rel=5e-3)
         assert long[1] / long[0] == pytest.approx(1.1, rel=2e-3)  # twice the weight on twice the stiffness
+
+
+@pytest.mark.parametrize("self_collision", [False, True])
+def test_memory_of_an_environment_is_as_estimated(self_collision):
+    points, faces = flat_sheet(0.3, 0.3, 0.03)
+    o = surfaces(sphere(), num_envs=2)
+    cloth = Run(garment(points, faces, wearer=0), obstacles=o, num_envs=2, self_collision=self_collision).cloth
+    structs = cloth.state, cloth._workspace, cloth._touches, cloth._self_contacts
+    arrays = [value for struct in structs for value in (getattr(struct, name) for name in struct._cls.vars)]
+    used = sum(each.capacity for each in arrays if isinstance(each, wp.array))
+    per_env = bytes_of_cloth(cloth.mesh, 1, self_collision) - 4 * cloth.mesh.num_edges  # lengths are shared here
+    assert used == pytest.approx(2 * per_env, rel=0.01)
