@@ -201,10 +201,15 @@ class ResidualPosterior:
         return total
 
     def draw(self, x: np.ndarray, count: int, seed: int) -> np.ndarray:
-        """Draw functions of the sum of squares at places ``(m, d)``, shape ``(count, m)``."""
+        """Draw functions of the sum of squares at places ``(m, d)``, shape ``(count, m)``.
+
+        What is matched differs from the smooth functions as any trial does, so each draw has an offset like the noise.
+        """
         total = np.zeros((count, len(x)))
+        rng = np.random.default_rng((seed, 1))
         for index, (offset, component) in enumerate(zip(self._offsets, self.components, strict=True)):
-            total += (offset + component.draw(x, count, seed + index)) ** 2
+            rough = rng.normal(0.0, component.noise, (count, 1))
+            total += (offset + rough + component.draw(x, count, seed + index)) ** 2
         return total
 
     def best(self, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
