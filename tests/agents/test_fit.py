@@ -178,6 +178,26 @@ def test_scripts_act_from_their_times_on(device):
         list(Player(wrong, Space(wrong), (), device=device).play([space.values([0.5])], [0]))
 
 
+def test_a_trained_policy_acts_in_the_environment_that_it_was_trained_for(device):
+    pytest.importorskip("rsl_rl", reason="needs the extra rsl")
+    folder = ROOT / "benchmarks" / "results" / "ppo" / "stand_0"
+    run = yaml.safe_load((folder / "config.yaml").read_text())
+    env = {**run["env"], "episode_seconds": 0.1, "physics": {**run["env"]["physics"], "fidelity": "tiny"}}
+    other = {"env_id": run["env_id"], "parameters": {"physics.friction": {"low": 0.5, "high": 1.0}}}
+    turned = []
+    for actor in ({"kind": "run", "run": str(folder)}, {"kind": "zero"}):
+        config = study(**other, env=env, actor=actor)
+        space = Space(config)
+        player = Player(config, space, ("bone_local_rotation",), device=device)
+        ((_, (episode,)),) = player.play([space.values([0.5])], [0])
+        turned.append(episode.readings["bone_local_rotation"][-1])
+        player.close()
+    assert not np.array_equal(*turned)
+    wrong = study(actor={"kind": "run", "run": str(folder)})
+    with pytest.raises(ConfigError, match="trained for other"):
+        list(Player(wrong, space := Space(wrong), (), device=device).play([space.values([0.5])], [0]))
+
+
 # The file.
 
 
