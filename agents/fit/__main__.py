@@ -69,9 +69,10 @@ def main(args: list[str] | None = None) -> None:
             except KeyboardInterrupt:
                 done = len(study.trials())
                 print(f"\ninterrupted after {done} trials; go on with the same command", file=sys.stderr)
-            trials = study.trials()
+            trials = study.trials(residuals=True)
             if trials:
                 conclude(folder, config, player, trials, scorer.unit, console)
+            player.close()
 
 
 def _run(study: Study, player: Player, scorer: Scorer, trials: int) -> None:

@@ -17,6 +17,7 @@ from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.mpm.types import failure_name
+from piavatar_envs.sim.world import check_device
 
 #: Reading of scorers that has the time of each entry, beside those of :mod:`piavatar_envs.api.readings`.
 TIME = "time"
@@ -96,12 +97,12 @@ class Player:
             pictures: number of frames of an episode; 0 for none.
             device: Warp device.
         """
-        self.config, self.space, self.device = config, space, device
+        self.config, self.space, self.device = config, space, check_device(device)
         self.readings, self.pictures = tuple(readings), pictures
         self.world: World | None = None
         self.builds = 0
         # a renderer and a GPU are shared by all threads
-        threaded = wp.get_device(device).is_cpu and not pictures and available_cores() > 1
+        threaded = wp.get_device(self.device).is_cpu and not pictures and available_cores() > 1
         self._pool = ThreadPoolExecutor(available_cores(), "trial") if threaded else None
 
     def probe(self) -> World:

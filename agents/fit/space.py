@@ -3,8 +3,8 @@
 A name is dotted and counts entries of lists from 0: ``physics.young_modulus``, ``scene.props.0.velocity.1``. A setting
 that is a range, from which episodes draw, is set to a range of one value: ``randomize.mass_factor``, ``ball_mass``.
 
-A batch holds some settings for each of its environments (:meth:`Space.varies_in_a_batch`), so trials that differ in
-these alone are played at once; any other setting needs a build of its own for each of its values.
+A batch holds some settings for each of its environments (:attr:`Space.shared`), so trials that differ in these alone
+are played at once; any other setting needs a build of its own for each of its values.
 """
 
 from __future__ import annotations

@@ -50,6 +50,7 @@ class Trial:
         score: mean over its episodes; None if it has none.
         scores: of each episode.
         failure: cause, where there is no score.
+        residuals: mean over its episodes of what the scorer compares, shape ``(K,)``; None if there is none.
     """
 
     number: int
@@ -109,16 +110,16 @@ class Study:
         storage.engine.dispose()
         os.replace(partial, path)
 
-    def trials(self) -> list[Trial]:
-        """Return the finished trials, in order."""
+    def trials(self, residuals: bool = False) -> list[Trial]:
+        """Return the finished trials, in order, with their residuals if asked for."""
         found = []
         for trial in self._study.get_trials(deepcopy=False):
             attributes = trial.user_attrs
             complete = trial.state == optuna.trial.TrialState.COMPLETE
             score = float(trial.value) if complete else None
             scores, failure = tuple(attributes.get("scores", ())), attributes.get("failure", "")
-            residuals = _read_residuals(self._residuals_of(trial.number)) if complete else None
-            found.append(Trial(trial.number, dict(trial.params), score, scores, failure, residuals))
+            own = _read_residuals(self._residuals_of(trial.number)) if complete and residuals else None
+            found.append(Trial(trial.number, dict(trial.params), score, scores, failure, own))
         return found
 
     def _residuals_of(self, number: int) -> Path:

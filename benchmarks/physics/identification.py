@@ -66,7 +66,7 @@ def identify(seed: int, noise: float, options: Options, folder: Path) -> Iterato
     scorer.connect(player.probe())
     list(runner.progress(Study(config, space, folder).run(player, scorer), f"seed {seed}", config.trials))
     player.close()
-    trials = Study(config, space, folder).trials()
+    trials = Study(config, space, folder).trials(residuals=True)
     for count in options.trials:
         posterior = fit_posterior(space, trials[:count], seed)
         best = find_best(space, trials[:count], posterior, False, seed)
