@@ -222,29 +222,7 @@ def tracking(page: Page) -> None:
 
 def physics(page: Page) -> None:
     """Append every quantity against theory."""
-    found = page.result("physics.json")
-    if found is None:
-        return
-    held = sum(row["verdict"] == "holds" for row in found.rows)
-    page.add(
-        "## Physics against theory",
-        f"{held} of {len(found.rows)} quantities are within their tolerance; the others are listed as they are.",
-    )
-    page.table(
-        ("experiment", "quantity", "theory", "tolerance", "measured", ""),
-        (
-            (
-                row["title"],
-                row["quantity"],
-                row["theory"],
-                row["limit"],
-                row["value"],
-                "" if row["verdict"] == "holds" else "**fails**",
-            )
-            for row in found.rows
-        ),
-    )
-    page.add(found.source(page.folder))
+    _checked(page, "physics.json", "Physics against theory")
     for name, text in (
         ("elastodynamics", "Bars, a cantilever and impacts beside textbooks"),
         ("resolution", "Impacts at every fidelity"),
@@ -253,6 +231,31 @@ def physics(page: Page) -> None:
         if other is not None:
             page.picture(RESULTS / f"{name}.png", text)
             page.add(other.source(page.folder))
+
+
+def garments(page: Page) -> None:
+    """Append every quantity of garments, and its picture."""
+    if _checked(page, "garments.json", "Garments"):
+        page.picture(RESULTS / "garments.png", "Deviations over their tolerances")
+
+
+def _checked(page: Page, name: str, heading: str) -> bool:
+    """Append the table of a result whose rows have verdicts, and return whether it is there."""
+    found = page.result(name)
+    if found is None:
+        return False
+    held = sum(row["verdict"] == "holds" for row in found.rows)
+    page.add(
+        f"## {heading}",
+        f"{held} of {len(found.rows)} quantities are within their tolerance; the others are listed as they are.",
+    )
+    columns = ("experiment", "quantity", "theory", "tolerance", "measured", "")
+    names = ("title", "quantity", "theory", "limit", "value")
+    verdicts = ("" if row["verdict"] == "holds" else "**fails**" for row in found.rows)
+    rows = ((*(row[key] for key in names), verdict) for row, verdict in zip(found.rows, verdicts, strict=True))
+    page.table(columns, rows)
+    page.add(found.source(page.folder))
+    return True
 
 
 def robustness(page: Page) -> None:
@@ -325,6 +328,7 @@ SECTIONS: tuple[Callable[[Page], None], ...] = (
     pixels,
     tracking,
     physics,
+    garments,
     robustness,
     baselines,
     figures,
