@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 
 from benchmarks.physics.checks import HOLDS
 
-matplotlib.use("Agg")
-
+#: Colours of the file.
+SHADES = 64
 #: Shares of the tolerance that the axis shows.
 LEAST, MOST = 1e-3, 30.0
 #: Colours of values that hold and that fail.
@@ -37,13 +36,17 @@ def share(row: Mapping[str, Any]) -> float:
 
 def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write a picture of a table's rows, in its order."""
+    import matplotlib
+
+    matplotlib.use("Agg")
     from matplotlib import pyplot
+    from PIL import Image
 
     figure, axes = pyplot.subplots(figsize=(9.0, 0.9 + 0.19 * len(rows)))
     places = -np.arange(len(rows))
     shares = [share(row) for row in rows]
     holds = [row["verdict"] == HOLDS for row in rows]
-    shown = np.clip(shares, LEAST, MOST)
+    shown = np.where([row["value"] is None for row in rows], np.nan, np.clip(shares, LEAST, MOST))
     colors = [COLORS[held] for held in holds]
     axes.hlines(places, LEAST, shown, colors=colors, linewidth=2.0, alpha=0.35)
     axes.scatter(shown, places, c=colors, s=22, zorder=3)
@@ -60,5 +63,8 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     axes.grid(axis="x", alpha=0.25)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    figure.savefig(path, dpi=110, bbox_inches="tight", pil_kwargs={"optimize": True})
+    figure.savefig(path, dpi=110, bbox_inches="tight")
     pyplot.close(figure)
+    with Image.open(path) as drawn:
+        small = drawn.convert("RGB").quantize(SHADES, kmeans=4, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
