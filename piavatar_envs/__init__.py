@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from piavatar_envs.api.conformance import check_task
     from piavatar_envs.avatar.body.sources import register_source
     from piavatar_envs.avatar.motion import register_motion
+    from piavatar_envs.cloth.fabric import register_fabric
+    from piavatar_envs.cloth.garments import register_garment
     from piavatar_envs.envs.observations import ObservationTerm
     from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
     from piavatar_envs.mpm.materials import register_material
@@ -32,7 +34,9 @@ _LAZY = {
     "Term": "piavatar_envs.envs.task",
     "check_task": "piavatar_envs.api.conformance",
     "failure_name": "piavatar_envs.mpm.types",
+    "register_fabric": "piavatar_envs.cloth.fabric",
     "register_game": "piavatar_envs.tasks.games",
+    "register_garment": "piavatar_envs.cloth.garments",
     "register_material": "piavatar_envs.mpm.materials",
     "register_motion": "piavatar_envs.avatar.motion",
     "register_source": "piavatar_envs.avatar.body.sources",
@@ -46,7 +50,9 @@ __all__ = [
     "Term",
     "check_task",
     "failure_name",
+    "register_fabric",
     "register_game",
+    "register_garment",
     "register_material",
     "register_motion",
     "register_source",

@@ -13,6 +13,8 @@ from piavatar_envs.cloth.wearer import Wearer
 
 #: Ease at the chest [m], and passes of smoothing.
 _EASE, _SMOOTHING = 0.010, 32
+#: Share of that ease at the neckline, and the way from it over which it grows [m].
+_AT_COLLAR, _SET_IN = 0.3, 0.06
 #: Place of armholes along the upper arm, where there are no sleeves.
 _ARMHOLE = 0.04
 
@@ -55,15 +57,18 @@ def cut_bodice(
     along = along_limb(wearer, "shoulder", "elbow", "wrist")
     height, chest = wearer.vertices[:, 2], wearer.at("spine3")[2]
     end = max(sleeve, _ARMHOLE)
-    field = np.minimum(below_neck(wearer, neckline), limb_field(wearer, along, end, "shoulder", "elbow"))
+    collar = below_neck(wearer, neckline)
+    field = np.minimum(collar, limb_field(wearer, along, end, "shoulder", "elbow"))
     field = np.minimum(field, np.where(wearer.arms, 1.0, height - bottom))
     reach = np.clip(np.where(np.isfinite(along), along, 0.0) / max(end, 0.3), 0.0, 1.0)
     # the ease belongs to the material: it stays that of each vertex on other shapes
     down = np.clip((chest - height) / max(chest - bottom, 1.0e-3), 0.0, 1.0)
     share = np.where(wearer.arms, 0.7 * reach, down**1.5)
 
+    near = _EASE * (_AT_COLLAR + (1.0 - _AT_COLLAR) * np.clip(collar / _SET_IN, 0.0, 1.0))
+
     def ease(_: Wearer, blend: sparse.csr_array, __: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return normals * (_EASE + loose * (blend @ share))[:, None]
+        return normals * (blend @ (near + loose * share))[:, None]
 
     panel = lay_out(wearer, field, ease, gap, edge, _SMOOTHING)
     left, right = (panel.anchors @ wearer.turned_by(joint) for joint in ("left_shoulder", "right_shoulder"))

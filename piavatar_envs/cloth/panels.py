@@ -27,7 +27,7 @@ from piavatar_envs.cloth.wearer import Wearer
 Ease = Callable[[Wearer, sparse.csr_array, np.ndarray, np.ndarray], np.ndarray]
 #: Base of the neck below its joint, over the way to that of the chest, slope of its plane, lower in front, and width of
 #: a neckline over that of the shoulders' joints.
-_COLLAR, _TILT, _WIDTH = 0.12, 0.45, 0.5
+_COLLAR, _TILT, _WIDTH = 0.03, 0.45, 0.45
 #: Shares of a smoothing pass and of the one back, which keeps the size.
 _SHARES = 0.63, -0.65
 #: Passes along the coarse mesh, which make its edges even.

@@ -80,7 +80,7 @@ def make_garment(
     def compute() -> dict[str, np.ndarray]:
         return _made(kind, settings, fabric, asset, parameters, grading, layer)
 
-    source = sys.modules[cutter(kind).__module__]
+    source = sys.modules.get(cutter(kind).__module__)
     if getattr(source, "__file__", None) is None:  # code without a file has no digest
         arrays = compute()
     else:
