@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -141,8 +143,12 @@ def test_a_body_in_a_shirt_does_not_wear_the_painted_one(make_batch, put_on):
     bare, look = shirted(), simulation.flesh[0].asset.drawn.vertices.copy()
     put_on(simulation, tube(0.5, 0.95, 0.2))
     assert shirted() == bare > 1000
-    put_on(simulation, tube(0.6, 1.5, 0.22, rows=20, kind="dress"))
+    dress = tube(0.6, 1.5, 0.22, rows=20, kind="dress")
+    put_on(simulation, dress)
     assert shirted() == 0
+    behind = (dress.draped[dress.mesh.faces][..., 1] > 0.0).all(axis=1)
+    put_on(simulation, replace(dress, kind="cape", mesh=replace(dress.mesh, faces=dress.mesh.faces[behind])))
+    assert shirted() == bare
     assert (simulation.flesh[0].asset.drawn.vertices == look).all()  # the body itself is the same
 
 
