@@ -315,6 +315,10 @@ def push(p: Pushed, depth: float, n: wp.vec3, goes: wp.vec3, friction: float, po
     if wp.dot(n, p.normal) < 0.0:  # its thickness would push the two apart without end
         q.squeezed = 1
         q.u = goes / dt
+        # it sticks to the one that pushes last: the other one would shift it along that surface, and stretch the cloth
+        stuck = p.z - p.way + goes
+        q.z = stuck + wp.dot(q.z - stuck, n) * n
+        q.way = q.z - (p.z - p.way)
     return q
 
 

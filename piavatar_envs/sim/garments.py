@@ -275,7 +275,7 @@ def prop_piece(column: int, props: PropSet, state: State) -> Piece:
     """Return the surface of the prop in a ``column``, which its particles deform."""
     model, prop, points = props.model, props.props[column], props.points[column]
     vertices, faces = points.vertices, points.faces
-    if len(vertices) > MOST_PROP_VERTICES:
+    if len(np.unique(faces)) > MOST_PROP_VERTICES:
         found = remesh(vertices, faces, MOST_PROP_VERTICES)
         vertices, faces = vertices[found.keep], found.faces
     solid = SolidSurface(points.rest, vertices, faces)

@@ -227,6 +227,24 @@ def test_cloth_and_body_keep_their_momentum(make_batch, mode):
     assert after[1] == pytest.approx(before[1], abs=2e-3 * scale)
 
 
+def test_a_body_that_falls_lies_on_its_garment_in_peace(make_batch):
+    # cloth between floor and body must neither lift the body nor shake
+    batch = make_batch(STAND, 1, control="pd", root_assist=0.0, episode_seconds=100.0, garments=[{"kind": "skirt"}])
+    batch.reset(seeds=[0])
+    garments, dt, forces, speeds = batch.simulation.garments, batch.task.config.physics.control_dt, [], []
+    for _ in range(120):
+        batch.step()
+        forces.append(np.linalg.norm(garments.surfaces._receivers.force.numpy()[0].sum(axis=0)) / dt)
+        speeds.append(np.linalg.norm(garments.cloth.state.v.numpy()[0], axis=1).max())
+    assert batch.simulation.avatar.tracked.position.numpy()[0, 0, 2] < 0.2 and not batch.failure.numpy().any()
+    assert max(forces[-30:]) < 3.0 * 9.81 * garments.cloth.mass.sum()
+    assert max(speeds[-30:]) < 0.3
+    edges, x = garments.cloth.mesh.edges, garments.cloth.state.x.numpy()[0]
+    span = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
+    strain = span / garments.cloth.length.numpy()[0] - 1.0
+    assert np.sqrt((strain**2).mean()) < 0.05 and strain.max() < 0.4
+
+
 def test_a_thrown_ball_pushes_a_skirt_and_is_slowed_by_it(make_batch):
     # Without gravity, air and ground; the ball flies at the front of the skirt, below the trunk.
     ball = BALL | {"velocity": [0.0, 1.0, 0.0], "position": [0.0, -0.5, 0.72]}
