@@ -37,8 +37,8 @@ _INSIDE, _FAR_INSIDE, _OUTSIDE = 0.03, 0.10, 0.03
 _TUCKED, _LAYER = 0.007, 0.009
 #: Greatest distance of points of a garment, among which the nearest is looked for [m].
 _SPACING = 0.01
-#: Share of chest and back that garments cover which replace a painted shirt.
-_MOST = 0.5
+#: Share of the chest, in front and at the back, that a garment covers which replaces a painted shirt.
+_MOST = 0.6
 
 #: Garments of avatars, and the assets that :func:`worn_asset` has made for them.
 _worn: WeakKeyDictionary[Flesh, tuple[list[Garment], AvatarAsset]] = WeakKeyDictionary()
@@ -60,9 +60,10 @@ def _wearing(asset: AvatarAsset, parameters: np.ndarray, garments: Sequence[Garm
         skin = asset.shape(parameters).vertices.astype(np.float64)
         chest = dense_weights(asset.skin_joints, asset.skin_weights)[:, joint_index("spine3")] > 0.5
         normals = smooth_normals(skin, asset.faces)
-        covered = np.max([_covered(garment, skin, normals)[0] for garment in garments], axis=0) > 0.0
-        sides = (covered[chest & (way * normals[:, 1] > 0.3)].mean() for way in (1.0, -1.0))
-        if min(sides) > _MOST:  # neither a scarf nor a cape
+        sides = [chest & (way * normals[:, 1] > 0.3) for way in (1.0, -1.0)]
+        covered = [_covered(garment, skin, normals)[0] for garment in garments]
+        # neither a scarf nor a cape, nor both together
+        if max(min(each[side].mean() for side in sides) for each in covered) > _MOST:
             asset = replace(asset, outfit=partial(dressed, with_shirt=False))
     look, shown = asset.drawn, asset.shape_drawn(parameters).vertices.astype(np.float64)
     normals = smooth_normals(shown, look.faces)
