@@ -26,6 +26,8 @@ NOISE, NOISE_SPREAD = 1.0e-3, 2.5
 STARTS, POINTS, FUNCTIONS = 4, 512, 400
 #: Principal components of residuals, at most, and the share of their variance that is modelled.
 COMPONENTS, EXPLAINED = 10, 0.9999
+#: Least number of trials a parameter that a model of residuals is fitted to.
+NEAREST = 6
 
 
 def matern(a: np.ndarray, b: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -63,13 +65,14 @@ class Posterior:
         noise: standard deviation of the score of a single trial.
     """
 
-    def __init__(self, x: np.ndarray, y: np.ndarray, seed: int = 0) -> None:
+    def __init__(self, x: np.ndarray, y: np.ndarray, seed: int = 0, count: int = STARTS) -> None:
         """Fit the process.
 
         Args:
             x: places in the unit cube, shape ``(n, d)``.
             y: scores, shape ``(n,)``.
             seed: of the starts of the search.
+            count: of these starts.
 
         Raises:
             ValueError: fewer than two trials.
@@ -79,11 +82,11 @@ class Posterior:
         self.x, self.y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         self.center, self.spread = float(self.y.mean()), float(self.y.std()) or 1.0
         self._z = (self.y - self.center) / self.spread
-        count = self.x.shape[1]
-        prior = np.log([*[LENGTH] * count, 1.0, NOISE])
-        spread = np.array([*[LENGTH_SPREAD] * count, 1.0, NOISE_SPREAD])
-        bounds = [*[(np.log(0.01), np.log(30.0))] * count, (np.log(0.05), np.log(100.0)), (np.log(1e-7), 0.0)]
-        starts = [prior, *(prior + spread * np.random.default_rng(seed).normal(0.0, 1.0, (STARTS - 1, count + 2)))]
+        d = self.x.shape[1]
+        prior = np.log([*[LENGTH] * d, 1.0, NOISE])
+        spread = np.array([*[LENGTH_SPREAD] * d, 1.0, NOISE_SPREAD])
+        bounds = [*[(np.log(0.01), np.log(30.0))] * d, (np.log(0.05), np.log(100.0)), (np.log(1e-7), 0.0)]
+        starts = [prior, *(prior + spread * np.random.default_rng(seed).normal(0.0, 1.0, (count - 1, d + 2)))]
         lowest, highest = np.transpose(bounds)
 
         def density(constants: np.ndarray) -> float:
@@ -177,20 +180,37 @@ def best_places(
 class ResidualPosterior:
     """Gaussian processes of the residuals' principal components, whose sum of squares is to be least."""
 
-    def __init__(self, x: np.ndarray, residuals: np.ndarray, seed: int = 0) -> None:
+    def __init__(self, x: np.ndarray, residuals: np.ndarray, seed: int = 0, starts: int = STARTS) -> None:
         """Fit the processes.
 
         Args:
             x: places in the unit cube, shape ``(n, d)``.
             residuals: of every trial, shape ``(n, K)``.
             seed: of the starts of the searches.
+            starts: number of these for each component.
         """
         center = residuals.mean(axis=0)
         left, sizes, right = np.linalg.svd(residuals - center, full_matrices=False)
         share = np.cumsum(sizes**2) / max(float((sizes**2).sum()), 1e-300)
         count = min(COMPONENTS, 1 + int(np.searchsorted(share, EXPLAINED)))
         self._offsets = right[:count] @ center
-        self.components = [Posterior(x, left[:, k] * sizes[k], seed) for k in range(count)]
+        self.components = [Posterior(x, left[:, k] * sizes[k], seed, starts) for k in range(count)]
+
+    @classmethod
+    def near_match(
+        cls, x: np.ndarray, y: np.ndarray, residuals: np.ndarray, seed: int = 0, starts: int = STARTS
+    ) -> ResidualPosterior:
+        """Fit to the third of the trials that match best, where residuals are smooth and nearly linear.
+
+        Args:
+            x: places in the unit cube, shape ``(n, d)``.
+            y: distances, shape ``(n,)``.
+            residuals: of every trial, shape ``(n, K)``.
+            seed: of the starts of the searches.
+            starts: number of these for each component.
+        """
+        near = np.argsort(y, kind="stable")[: max(len(y) // 3, NEAREST * x.shape[1])]
+        return cls(x[near], residuals[near], seed, starts)
 
     def expected(self, x: np.ndarray) -> np.ndarray:
         """Return the expected sum of squares at places ``(m, d)``, but for a constant."""
@@ -214,8 +234,17 @@ class ResidualPosterior:
 
     def best(self, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the place of the least expected sum of squares, and the 95 % interval of the place."""
+        place, points = self.least(seed), self._points(seed)
+        return place, *best_places(lambda at, s: -self.draw(at, FUNCTIONS // 2, s), place, points, seed)
+
+    def _points(self, seed: int) -> np.ndarray:
+        """Return points all over the unit cube, and those of the trials."""
         x = self.components[0].x
-        points = np.concatenate([qmc.Sobol(x.shape[1], seed=seed).random(POINTS), x])
+        return np.concatenate([qmc.Sobol(x.shape[1], seed=seed).random(POINTS), x])
+
+    def least(self, seed: int = 0) -> np.ndarray:
+        """Return the place of the least expected sum of squares, shape ``(d,)``."""
+        points = self._points(seed)
         values = self.expected(points)
         scale = float(values.min()) or 1.0
         found = [
@@ -223,9 +252,8 @@ class ResidualPosterior:
                 lambda at: float(self.expected(at[None])[0]) / scale,
                 start,
                 method="L-BFGS-B",
-                bounds=[(0.0, 1.0)] * x.shape[1],
+                bounds=[(0.0, 1.0)] * points.shape[1],
             )
             for start in points[np.argsort(values)[:5]]
         ]
-        place = np.clip(min(found, key=lambda result: result.fun).x, 0.0, 1.0)
-        return place, *best_places(lambda at, s: -self.draw(at, FUNCTIONS // 2, s), place, points, seed)
+        return np.clip(min(found, key=lambda result: result.fun).x, 0.0, 1.0)

@@ -21,8 +21,6 @@ from piavatar_envs.config import EnvConfig, dump_yaml, replace
 
 #: Least number of trials with a score of which there is a posterior, and points of a plotted curve.
 LEAST_TRIALS, CURVE = 4, 201
-#: Least number of trials a parameter that a model of residuals is fitted to.
-NEAREST = 6
 
 
 def fit_posterior(space: Space, trials: Sequence[Trial], seed: int) -> Posterior | None:
@@ -34,17 +32,12 @@ def fit_posterior(space: Space, trials: Sequence[Trial], seed: int) -> Posterior
 
 
 def find_best(space: Space, trials: Sequence[Trial], posterior: Posterior, maximize: bool, seed: int) -> Best:
-    """Return the best point: by the posterior of the score, or of the residuals where every scored trial has them.
-
-    Residuals are modelled for the third of the trials that match best, where they are smooth and nearly linear.
-    """
+    """Return the best point: by the posterior of the score, or of the residuals where every scored trial has them."""
     scored = [trial for trial in trials if trial.score is not None]
     residuals = [trial.residuals for trial in scored if trial.residuals is not None]
     if maximize or len(residuals) < len(scored) or len({len(own) for own in residuals}) != 1:
         return posterior.best(maximize, seed)
-    count = max(len(scored) // 3, NEAREST * len(space.axes))
-    near = np.argsort(posterior.y, kind="stable")[:count]
-    model = ResidualPosterior(posterior.x[near], np.array(residuals, np.float64)[near], seed)
+    model = ResidualPosterior.near_match(posterior.x, posterior.y, np.array(residuals, np.float64), seed)
     return posterior.at(*model.best(seed))
 
 

@@ -20,6 +20,7 @@ from scipy.stats import qmc
 
 from agents.files import write_atomically
 from agents.fit.config import FitConfig
+from agents.fit.posterior import ResidualPosterior
 from agents.fit.rollout import Episode, Player
 from agents.fit.scorers import Scorer, Unscored
 from agents.fit.space import Space
@@ -36,6 +37,9 @@ except ImportError:
 FILE, NAME, ABOUT = "study.db", "fit", "config"
 #: Folder of what the scorer compares, a file a trial.
 RESIDUALS = "residuals"
+#: One in so many trials is at the best match of a model of residuals, if there are any, once there are enough of them;
+#: places closer than that, in the unit cube, are the same.
+MATCHING, LEAST_MATCHED, SAME_PLACE = 3, 8, 0.002
 #: Settings that may differ when a study goes on: the trials before are the same.
 FREE = ("trials", "question")
 
@@ -132,7 +136,7 @@ class Study:
         Raises:
             ConfigError: the file holds trials that these settings do not propose.
         """
-        while (done := len(found := self.trials())) < self.config.trials:
+        while (done := len(found := self.trials(hasattr(scorer, "residuals")))) < self.config.trials:
             first = done - done % self.config.batch
             count = min(self.config.batch, self.config.trials - first)
             proposed = self._propose(found[:first], count)
@@ -153,14 +157,33 @@ class Study:
         worst = (min if self.maximize else max)(scores, default=0.0)
         for trial in before:
             memory.add_trial(self._frozen(trial.values, worst if trial.score is None else trial.score))
-        proposed = []
-        for number in range(len(before), len(before) + count):
+        proposed, numbers = [], range(len(before), len(before) + count)
+        # the first of a batch alone, since it would be the same place again
+        matching = next(
+            (number for number in numbers if number % MATCHING == 0 and number >= self.config.startup), None
+        )
+        for number in numbers:
             memory.sampler = self._sampler(number)
             if self.config.sampler == "gp" and number < self.config.startup:
                 memory.enqueue_trial(self.space.values(self._startup()[number]))
+            elif number == matching and (match := self._match(before)) is not None:
+                memory.enqueue_trial(self.space.values(match))
             trial = memory.ask(self._distributions)
             proposed.append({axis.name: trial.params[axis.name] for axis in self.space.axes})
         return proposed
+
+    def _match(self, before: Sequence[Trial]) -> np.ndarray | None:
+        """Return the place at which a model of the residuals matches best, shape ``(parameters,)``.
+
+        None for other samplers, for too few trials with residuals, or where the place was tried before.
+        """
+        matched = [trial for trial in before if trial.residuals is not None]
+        if self.config.sampler != "gp" or len(matched) < LEAST_MATCHED or self.maximize:
+            return None
+        x, y = self.space.shares([trial.values for trial in matched]), np.array([trial.score for trial in matched])
+        residuals = np.array([trial.residuals for trial in matched], np.float64)
+        place = ResidualPosterior.near_match(x, y, residuals, self.config.seed, starts=1).least(self.config.seed)
+        return None if np.abs(x - place).max(axis=1).min() < SAME_PLACE else place
 
     def _startup(self) -> np.ndarray:
         """Return the points of the first trials in the unit cube, shape ``(startup, parameters)``."""
