@@ -229,18 +229,31 @@ class ToyScorer:
         return -((np.log(mass) - 1.0) ** 2)
 
 
+class ToyMatch(ToyScorer):
+    """Scores values by their distance from a place, and has the differences."""
+
+    def score(self, values):
+        """Return the score."""
+        return float(np.linalg.norm(self.residuals(values)))
+
+    def residuals(self, values):
+        """Return the differences."""
+        share = np.log(values["scene.props.0.mass"]) - 1.0
+        return np.array([np.sin(share), share**2, np.expm1(share)], np.float32)
+
+
 class _Episode(dict):
     failure = ""
 
 
-def play_toy(config, folder, kill_at=None):
+def play_toy(config, folder, kill_at=None, scorer=ToyScorer):
     folder.mkdir(exist_ok=True)
     toy = Toy(kill_at)
     original = toy.play
     toy.play = lambda trials, wanted: ((i, [_Episode(e[0])]) for i, e in original(trials, wanted))
     own = Study(config, Space(config), folder)
     with suppress(KeyboardInterrupt):
-        list(own.run(toy, ToyScorer()))
+        list(own.run(toy, scorer()))
     return own.trials()
 
 
@@ -258,6 +271,18 @@ def test_a_killed_study_goes_on_with_the_same_trials(sampler, batch, tmp_path):
     longer = play_toy(config.model_copy(update={"trials": 11}), tmp_path / "killed")
     assert longer[:9] == whole and len(longer) == 11
     assert play_toy(config.model_copy(update={"seed": 4, "trials": 3}), tmp_path / "other") != whole[:3]
+
+
+def test_a_killed_identification_goes_on_with_the_same_trials_and_closes_in(tmp_path):
+    config = study(direction="minimize", trials=14, startup=9, batch=2)
+    whole = play_toy(config, tmp_path / "whole", scorer=ToyMatch)
+    for kill_at in (9, 3, None):
+        killed = play_toy(config, tmp_path / "killed", kill_at, ToyMatch)
+        assert killed == whole[: len(killed)]
+    assert killed == whole
+    # trial 9 is where the model of the residuals matches best
+    assert whole[9].values["scene.props.0.mass"] == pytest.approx(np.e, rel=2e-3)
+    assert whole[9].score < 0.1 * min(trial.score for trial in whole[:9])
 
 
 def test_a_file_of_other_settings_or_of_something_else_is_refused(tmp_path):
