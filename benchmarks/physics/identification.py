@@ -38,7 +38,7 @@ class Options(runner.Options):
     #: seeds of hidden parameters, noise and sampler
     seeds: tuple[int, ...] = (0, 1, 2)
     #: standard deviations of the noise of bones, props and markers [m]
-    noises: tuple[float, ...] = (0.0, 0.005)
+    noises: tuple[float, ...] = (0.0,)
     #: numbers of trials after which the errors are taken
     trials: tuple[int, ...] = (30, 45, 60)
     #: number of markers
