@@ -46,7 +46,7 @@ FAILURE_DOCS = {
     "action": "an action was not finite",
     "blocks": "the flesh is spread over more blocks of the grid than have memory",
     "force": "an external force was not finite, or one too many",
-    "cloth": "a garment has moved beyond all bounds",
+    "cloth": "a position or velocity of cloth is not finite",
 }
 USAGE = """```python
 import gymnasium as gym
