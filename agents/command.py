@@ -20,8 +20,13 @@ from piavatar_envs.config import ConfigError, load_config
 Options = TypeVar("Options")
 
 #: Scripts by the folder of a configuration, and settings that no other script's configuration has.
-_FOLDERS = {"rsl_rl": "rsl_rl.train", "sb3": "sb3.train", "skrl": "skrl.train"}
-_SETTINGS = {"rsl_rl.train": {"iterations", "ppo"}, "sb3.train": {"total_steps"}, "skrl.train": {"mappo"}}
+_FOLDERS = {"fit": "fit", "rsl_rl": "rsl_rl.train", "sb3": "sb3.train", "skrl": "skrl.train"}
+_SETTINGS = {
+    "fit": {"parameters", "scorer"},
+    "rsl_rl.train": {"iterations", "ppo"},
+    "sb3.train": {"total_steps"},
+    "skrl.train": {"mappo"},
+}
 
 _registry = ConstructorRegistry()
 

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from piavatar_envs.avatar.body import sources
+from piavatar_envs.avatar.motion import library
+from piavatar_envs.cloth import fabric, garments
 from piavatar_envs.config import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,6 +82,8 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
     if "deepmimic:" in "".join(blocks(PAGES[name])):
         pytest.importorskip("pybullet", reason="needs the extra motions")
     monkeypatch.chdir(ROOT)
+    for module in (garments, fabric, sources, library):  # what a page registers ends with it
+        monkeypatch.setattr(module, "_registered", dict(module._registered))
     monkeypatch.setattr(sb3, "PPO", partial(sb3.PPO, n_steps=8, batch_size=8))
     monkeypatch.syspath_prepend(tmp_path)
     saved = re.findall(r"[Ss]ave this as\s`([\w.]+)`", PAGES[name].read_text(encoding="utf-8"))

@@ -156,13 +156,13 @@ def check(
     return register
 
 
-def chosen(only: Iterable[str], among: Mapping[str, Check] = CHECKS) -> list[Check]:
-    """Return the checks among some whose names begin with one of ``only``; all if it is empty.
+def chosen(only: Iterable[str], among: Mapping[str, Check] | None = None) -> list[Check]:
+    """Return the checks among some, or all of physics, whose names begin with one of ``only``; all if it is empty.
 
     Raises:
         SystemExit: a beginning fits no check.
     """
-    only = tuple(only)
+    among, only = CHECKS if among is None else among, tuple(only)
     for beginning in only:
         if not any(name.startswith(beginning) for name in among):
             raise SystemExit(f"--only {beginning}: no such check; the checks are {', '.join(among)}")

@@ -18,7 +18,7 @@ from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Metric, Task, Term
-from piavatar_envs.tasks.common.ranges import Margin, Weight, check_ranges
+from piavatar_envs.tasks.common.ranges import DistanceRange, Margin, Weight, check_ranges
 from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
 from piavatar_envs.tasks.common.root_command import record_root_clamp
 from piavatar_envs.tasks.common.spawn import record_standing
@@ -41,7 +41,7 @@ class TwirlConfig(EnvConfig):
         description="garments of every avatar; the hem is that of the first",
     )
     joints: tuple[str, ...] | None = Field(UPPER_BODY, description="joints that act; null for all 21")
-    lift: tuple[float, float] = Field((0.05, 0.16), description="range of the height to which the hem shall rise [m]")
+    lift: DistanceRange = Field((0.05, 0.16), description="range of the height to which the hem shall rise [m]")
     period: float = Field(2.5, ge=0.1, le=3600.0, description="time after which another height is drawn [s]")
     lift_radius: float = Field(0.02, gt=0.0, le=1.0, description="distance from that height that counts as there [m]")
     margin: Margin = Field(0.1, description="distance beyond it at which the reward has fallen to 0.1 [m]")

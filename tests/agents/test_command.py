@@ -53,7 +53,7 @@ def test_options_that_there_are_not_are_refused(script, first, line, capsys):
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 #: The script that a folder of configurations belongs to.
-OWNERS = {"rsl_rl": "rsl_rl.train", "skrl": "skrl.train", "sb3": "sb3.train"}
+OWNERS = {"fit": "fit", "rsl_rl": "rsl_rl.train", "skrl": "skrl.train", "sb3": "sb3.train"}
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*/*.yaml")), ids=lambda path: path.stem)
@@ -61,7 +61,7 @@ def test_files_of_other_scripts_are_known_wherever_they_lie(path, tmp_path):
     owner = OWNERS[path.parent.name]
     copy = tmp_path / "config.yaml"
     copy.write_bytes(path.read_bytes())
-    for script in ("rsl_rl.train", "skrl.train", "sb3.train"):
+    for script in OWNERS.values():
         hint = "" if script == owner else f" (this is a file for python -m agents.{owner})"
         assert script_hint(path, script) == script_hint(copy, script) == hint
 
