@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
@@ -79,6 +80,19 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
         except Exception as error:  # a kernel that does not compile fails its own tests, not all that use a device
             warnings.warn(f"not every kernel compiles for {name}: {error}", stacklevel=1)
     yield name
+
+
+@pytest.fixture(autouse=True)
+def restored_registries() -> Iterator[None]:
+    """Unregister the garments and fabrics of a test after it, which messages of others would list."""
+    names = ("piavatar_envs.cloth.garments", "piavatar_envs.cloth.fabric")
+    before = {name: dict(sys.modules[name]._registered) for name in names if name in sys.modules}
+    yield
+    for name in names:
+        if name in sys.modules:
+            registered = sys.modules[name]._registered
+            registered.clear()
+            registered.update(before.get(name, {}))
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,6 @@ import pytest
 
 from piavatar_envs.avatar.body import sources
 from piavatar_envs.avatar.motion import library
-from piavatar_envs.cloth import fabric, garments
 from piavatar_envs.config import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -82,7 +81,7 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
     if "deepmimic:" in "".join(blocks(PAGES[name])):
         pytest.importorskip("pybullet", reason="needs the extra motions")
     monkeypatch.chdir(ROOT)
-    for module in (garments, fabric, sources, library):  # what a page registers ends with it
+    for module in (sources, library):  # what a page registers ends with it
         monkeypatch.setattr(module, "_registered", dict(module._registered))
     monkeypatch.setattr(sb3, "PPO", partial(sb3.PPO, n_steps=8, batch_size=8))
     monkeypatch.syspath_prepend(tmp_path)
