@@ -72,7 +72,7 @@ class ClothMesh:
             raise ValueError(f"triangle {bad} of the cloth has sides {sides[bad].tolist()} m, hence no area; remove it")
         edge_area = np.bincount(of_side.ravel(), np.repeat(area, 3), len(edges))
         vertex_area = np.bincount(faces.ravel(), np.repeat(area / 3.0, 3), num)
-        start = np.searchsorted(colors[order], np.arange(colors.max() + 2)).astype(np.int32)
+        start = _color_start(colors[order])
         q = _bending(faces, edges, of_side, sides, area)
         return cls(
             num, faces, edges, start, length, edge_area, vertex_area,
@@ -120,7 +120,7 @@ def joined(meshes: Sequence[ClothMesh]) -> ClothMesh:
         int(first[-1]),
         shifted("faces"),
         shifted("edges")[order],
-        np.searchsorted(colors[order], np.arange(colors.max() + 2)).astype(np.int32),
+        _color_start(colors[order]),
         all_of("length")[order],
         all_of("edge_area")[order],
         all_of("area"),
@@ -160,6 +160,11 @@ def _areas(sides: np.ndarray) -> np.ndarray:
     half = 0.5 * sides.sum(axis=1)
     with np.errstate(invalid="ignore"):
         return np.sqrt(half * np.prod(half[:, None] - sides, axis=1))
+
+
+def _color_start(colors: np.ndarray) -> np.ndarray:
+    """Return the first edge of each color, and the number of edges, of ascending colors."""
+    return np.searchsorted(colors, np.arange(colors.max() + 2)).astype(np.int32)
 
 
 def _bending(

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from piavatar_envs.avatar.body.asset import vertex_normals
 from piavatar_envs.avatar.body.splat_files import write_ply
 from piavatar_envs.avatar.body.textures import Texture, encoded
 from piavatar_envs.core.extras import missing
@@ -240,13 +241,10 @@ def _y_up(vectors: np.ndarray) -> np.ndarray:
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return unit normals of the vertices, weighted by the areas of their triangles, shape ``(V, 3)``."""
-    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
-    areas = np.cross(b - a, c - a)
-    sums = [np.bincount(faces.ravel(), np.repeat(areas[:, axis], 3), len(vertices)) for axis in range(3)]
-    normals = np.stack(sums, axis=1)
+    """Return unit normals of the vertices, up where triangles have no area, shape ``(V, 3)``."""
+    normals = vertex_normals(vertices, faces)
     size = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(size > 1e-20, normals / np.maximum(size, 1e-20), (0.0, 0.0, 1.0))
+    return np.where(size > 0.5, normals, (0.0, 0.0, 1.0))
 
 
 def glb_size(film: Film) -> int:
