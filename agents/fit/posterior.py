@@ -28,6 +28,8 @@ STARTS, POINTS, FUNCTIONS = 4, 512, 400
 COMPONENTS, EXPLAINED = 10, 0.9999
 #: Least number of trials a parameter that a model of residuals is fitted to.
 NEAREST = 6
+#: Distance in the unit cube below which trials crowd together.
+CROWDED = 0.01
 
 
 def matern(a: np.ndarray, b: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -209,7 +211,12 @@ class ResidualPosterior:
             seed: of the starts of the searches.
             starts: number of these for each component.
         """
-        near = np.argsort(y, kind="stable")[: max(len(y) // 3, NEAREST * x.shape[1])]
+        # of trials that crowd together one is enough: the model needs some spread
+        near: list[int] = []
+        for index in np.argsort(y, kind="stable"):
+            if all(np.abs(x[index] - x[other]).max() >= CROWDED for other in near):
+                near.append(int(index))
+        near = near[: max(len(y) // 3, NEAREST * x.shape[1])]
         return cls(x[near], residuals[near], seed, starts)
 
     def expected(self, x: np.ndarray) -> np.ndarray:
