@@ -8,7 +8,7 @@ EXTRAS := render,live,train,fit,motions,multi,props,skrl,rsl,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test test-lowest test-avatars test-vlm clients-light lint format docs clean
+.PHONY: help install demo test test-lowest test-avatars test-vlm test-rllib clients-light lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
@@ -17,6 +17,7 @@ help:
 	@echo "make test-lowest   test the views under the oldest supported Gymnasium and PettingZoo"
 	@echo "make test-avatars  compare avatars and motions with MakeHuman's data, body-models, pybvh and gsply"
 	@echo "make test-vlm      test the judge of agents.fit with a tiny vision-language model of transformers"
+	@echo "make test-rllib  test the ids and games with Ray's RLlib, also on two nodes of which one is killed"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code and build the site in build/site (PICTURES=1 draws the pages' pictures, too; CHECK=1 compares the pages only)"
@@ -79,6 +80,16 @@ $(VLM)/.installed: $(STAMP) tests/agents/requirements.txt
 
 test-vlm: $(VLM)/.installed
 	PYTHONPATH=$(VLM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/agents/test_fit_vlm.py
+
+# RLlib with the Gymnasium that it pins, in a folder of their own, which its processes import from, too.
+RLLIB := $(VENV)/rllib
+$(RLLIB)/.installed: $(STAMP) tests/rllib/requirements.txt
+	rm -rf $(RLLIB)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(RLLIB) --requirement tests/rllib/requirements.txt
+	@touch $@
+
+test-rllib: $(RLLIB)/.installed
+	PYTHONPATH=$(CURDIR)/$(RLLIB):$(CURDIR) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/rllib tests/test_docs.py -k "rllib"
 
 # Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
 # imports and compilation take longer than the tests.

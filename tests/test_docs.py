@@ -30,6 +30,7 @@ SMALLER = {
     "num_agents=3": "num_agents=2, fidelity='tiny', episode_seconds=0.5",
     ".learn(300)": ".learn(1)",
     'device="cuda"': "device=DEVICE",
+    'Path("reach").absolute()': 'FOLDER / "reach"',
     'Path("reach")': 'FOLDER / "reach"',
     'save("kick.png")': 'save(FOLDER / "kick.png")',
     'save("reach.png")': 'save(FOLDER / "reach.png")',
@@ -80,6 +81,8 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
         pytest.importorskip(needed, reason="needs the extras skrl, rsl and multi")
     if "deepmimic:" in "".join(blocks(PAGES[name])):
         pytest.importorskip("pybullet", reason="needs the extra motions")
+    if "import ray" in "".join(blocks(PAGES[name])):
+        pytest.importorskip("ray", reason="needs RLlib: make test-rllib")
     monkeypatch.chdir(ROOT)
     for module in (sources, library):  # what a page registers ends with it
         monkeypatch.setattr(module, "_registered", dict(module._registered))
