@@ -26,6 +26,8 @@ class Cut:
             ``positions``.
         fit: positions of the same vertices on another shape of the same body; None binds them to the nearest skin.
         thickness: distance at which it lies on the skin [m].
+        colors: sRGB of the vertices, shape ``(V, 3)`` uint8; None for those of the fabric.
+        replaces: name of the surface of the wearer's file that is no longer drawn, empty for none.
     """
 
     positions: np.ndarray
@@ -35,6 +37,8 @@ class Cut:
     lengths: Callable[[np.ndarray], np.ndarray] | None = None
     fit: Callable[[Wearer], np.ndarray] | None = None
     thickness: float = THICKNESS
+    colors: np.ndarray | None = None
+    replaces: str = ""
 
     def measure(self, pairs: np.ndarray) -> np.ndarray:
         """Return rest lengths of pairs of vertices ``(K, 2)`` [m]."""

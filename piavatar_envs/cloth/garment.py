@@ -57,6 +57,8 @@ class Garment:
         skin_joints: bones that place it at a reset, shape ``(V, 4)`` int32.
         skin_weights: their weights, shape ``(V, 4)``.
         shape_deltas: change of ``draped`` by the shape parameters [m], shape ``(2 S, V, 3)``; None without grading.
+        colors: sRGB of the vertices, shape ``(V, 3)`` uint8; None for those of the fabric.
+        replaces: name of the surface of the wearer's file that is not drawn, because this is it; empty for none.
     """
 
     kind: str
@@ -70,3 +72,5 @@ class Garment:
     skin_joints: np.ndarray | None = None
     skin_weights: np.ndarray | None = None
     shape_deltas: np.ndarray | None = None
+    colors: np.ndarray | None = None
+    replaces: str = ""

@@ -21,7 +21,7 @@ from scipy import sparse
 from piavatar_envs.avatar.body import sampling
 from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, top_weights, vertex_normals
 from piavatar_envs.avatar.body.sampling import ClosedSurface
-from piavatar_envs.cloth import bodice, contact, kernels, panels, pattern, remesh, solver
+from piavatar_envs.cloth import bodice, contact, kernels, panels, pattern, remesh, sheet, solver
 from piavatar_envs.cloth import mesh as meshing
 from piavatar_envs.cloth import wearer as wearers
 from piavatar_envs.cloth.cut import Cut
@@ -47,7 +47,7 @@ _STEP, _LONGEST, _DAMPING, _SLOW = 1.0 / 30.0, 12.0, 0.015, 10
 #: Passes over a garment in which weights of bones and changes of shape are smoothed.
 _BINDING = 12
 #: Modules whose code a made garment depends on.
-_CODE = (bodice, contact, kernels, meshing, panels, pattern, remesh, sampling, solver, wearers)
+_CODE = (bodice, contact, kernels, meshing, panels, pattern, remesh, sampling, sheet, solver, wearers)
 
 
 def make_garment(
@@ -84,7 +84,8 @@ def make_garment(
     if getattr(source, "__file__", None) is None:  # code without a file has no digest
         arrays = compute()
     else:
-        body = [asset.vertices, asset.faces, asset.skin_joints, asset.skin_weights, asset.shape_deltas]
+        worn = [[name, own] for name, own in asset.worn.items()]
+        body = [asset.vertices, asset.faces, asset.skin_joints, asset.skin_weights, asset.shape_deltas, worn]
         given = [kind, *(_content(item) for item in sorted(settings.items()))]
         digest = digest_of([body, given, fabric, parameters, grading, layer], [*_CODE, sys.modules[__name__], source])
         arrays = kept("garment", digest, compute, f"draping {kind} on {asset.name}")
@@ -101,6 +102,8 @@ def make_garment(
         skin_joints=arrays["skin_joints"],
         skin_weights=arrays["skin_weights"],
         shape_deltas=arrays["shape_deltas"] if grading else None,
+        colors=arrays["colors"] if len(arrays["colors"]) else None,
+        replaces=str(arrays["replaces"]),
     )
 
 
@@ -143,6 +146,8 @@ def _made(
         "skin_joints": joints,
         "skin_weights": weights,
         "shape_deltas": deltas.astype(np.float32),
+        "colors": np.zeros((0, 3), np.uint8) if cut.colors is None else cut.colors,
+        "replaces": np.array(cut.replaces),
         **{field.name: np.asarray(getattr(mesh, field.name)) for field in fields(mesh)},
     }
 

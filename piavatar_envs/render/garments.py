@@ -48,7 +48,10 @@ class GarmentMesh:
 
     @staticmethod
     def of(garment: Garment, over: Sequence[Garment] = ()) -> GarmentMesh:
-        """Divide a garment, close its borders, colour its sides, and let it sink beneath those ``over`` it."""
+        """Divide a garment, close its borders, colour its sides, and let it sink beneath those ``over`` it.
+
+        Colours of its own, such as those of a file, are the same on both sides.
+        """
         levels = levels_for(garment.mesh.faces, garment.draped, _EDGE)
         fine = subdivided(garment.mesh.faces, garment.mesh.num_vertices, levels)
         matrix, sides = fine.matrix, np.array([garment.fabric.front, garment.fabric.back])
@@ -56,7 +59,10 @@ class GarmentMesh:
         rows = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
         depth = matrix @ np.max([np.zeros(matrix.shape[1]), *(layering(garment, other) for other in over)], axis=0)
         faces = both_sides(fine.faces, matrix.shape[0])
-        return GarmentMesh(rows, depth, faces, np.repeat(colors, matrix.shape[0], axis=0))
+        painted = np.repeat(colors, matrix.shape[0], axis=0)
+        if garment.colors is not None:
+            painted = np.tile(np.rint(matrix @ garment.colors.astype(np.float64)).clip(0, 255).astype(np.uint8), (2, 1))
+        return GarmentMesh(rows, depth, faces, painted)
 
     @property
     def num_vertices(self) -> int:

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, vertex_normals
+from piavatar_envs.avatar.body.asset import AvatarAsset, Look, dense_weights, vertex_normals
 from piavatar_envs.avatar.body.outfit import dressed
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.render.subdivision import levels_for, subdivided
@@ -69,7 +69,17 @@ def _wearing(asset: AvatarAsset, parameters: np.ndarray, garments: Sequence[Garm
     normals = smooth_normals(shown, look.faces)
     depth = np.max([sinking(garment, shown, normals) for garment in garments], axis=0)
     sunk = (look.vertices - depth[:, None] * normals).astype(np.float32)
-    return replace(asset, look=replace(look, vertices=sunk))
+    return replace(asset, look=_without(replace(look, vertices=sunk), asset, garments))
+
+
+def _without(look: Look, asset: AvatarAsset, garments: Sequence[Garment]) -> Look:
+    """Return a look without the surfaces of the file that garments are made of."""
+    gone = [asset.worn[garment.replaces].drawn for garment in garments if garment.replaces]
+    if not gone:
+        return look
+    left = np.setdiff1d(np.arange(len(look.faces)), np.concatenate(gone))
+    textures = None if look.textures is None else look.textures.chosen(np.arange(len(look.vertices)), left)
+    return replace(look, faces=look.faces[left], textures=textures)
 
 
 def sinking(garment: Garment, points: np.ndarray, normals: np.ndarray) -> np.ndarray:

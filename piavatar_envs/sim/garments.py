@@ -7,6 +7,7 @@ has given to the surfaces. Nothing but the cloth itself is carried from one step
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -63,9 +64,10 @@ def tailor(config: EnvConfig, flesh: Sequence[Flesh]) -> list[Garment]:
         for layer, given in enumerate(worn_by(config, own)):
             wearer = own.asset, own.base_parameters, index, own.shape.randomize, layer
             try:
-                garments.append(make_garment(given.kind, given.settings, given.cloth, *wearer))
+                garment = make_garment(given.kind, given.settings, given.cloth, *wearer)
             except (OSError, TypeError, ValueError) as error:
                 raise ConfigError(f"garments: {error}") from None
+            garments.append(garment if given.color is None else replace(garment, colors=None))
     return garments
 
 

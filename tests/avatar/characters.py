@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -87,3 +89,26 @@ def _ring(along: np.ndarray, sectors: int, closed: bool) -> tuple[np.ndarray, np
     faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
     angles = np.tile(2.0 * np.pi * np.arange(sectors) / sectors, count)
     return np.column_stack([np.repeat(along, sectors), angles]), faces
+
+
+def in_a_skirt(character: Character, points: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]) -> Character:
+    """Return a character of the body of an asset that wears a surface as files have it, skinned with the nearest skin.
+
+    Args:
+        character: the body, as its only surface.
+        points: of the surface, in the character's coordinates and pose [m], shape ``(W, 3)``.
+        faces: its triangles.
+        color: of its vertices, sRGB.
+    """
+    count, parameters = len(character.vertices), len(character.shape_names)
+    nearest = cKDTree(character.vertices).query(points)[1]
+    surfaces = (*character.surfaces, Surface("Skirt", len(character.faces), len(character.faces) + len(faces), "Cloth"))
+    return dataclasses.replace(
+        character,
+        vertices=np.concatenate([character.vertices, points]),
+        faces=np.concatenate([character.faces, faces + count]).astype(np.int32),
+        weights=np.concatenate([character.weights, character.weights[nearest]]),
+        colors=np.concatenate([character.colors, np.tile(np.array(color, np.uint8), (len(points), 1))]),
+        surfaces=surfaces,
+        shape_deltas=np.concatenate([character.shape_deltas, np.zeros((parameters, 2, len(points), 3))], axis=2),
+    )

@@ -119,6 +119,23 @@ class SurfacePoints:
 
 
 @dataclass(frozen=True, eq=False)
+class WornSurface:
+    """A surface of a character's file that is no body, such as a skirt; a garment can be made of it.
+
+    Attributes:
+        vertices: in the reference pose of the mean shape [m], shape ``(W, 3)`` float32.
+        faces: triangles, shape ``(U, 3)`` int32.
+        colors: sRGB of the vertices, shape ``(W, 3)`` uint8, or None for the one colour of the avatar.
+        drawn: triangles of the look that draw it, as indices into its faces, shape ``(K,)`` int32.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None
+    drawn: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class AvatarAsset:
     """A skinned, shapeable body. Axes: metres, z up, facing -y, its left is +x; joints as in ``skeleton.py``.
 
@@ -140,6 +157,7 @@ class AvatarAsset:
         skeleton: where bone particles are put; None puts them around the bones' axes.
         groups: weights in [0, 1] of the vertices in groups that the file names, each shape ``(V,)`` float32.
         surface_points: particles at the skin besides those that fill the body; None for none.
+        worn: surfaces of the file that are worn, by their names and those of their materials.
     """
 
     name: str
@@ -156,6 +174,7 @@ class AvatarAsset:
     skeleton: SkeletonPoints | None = None
     groups: Mapping[str, np.ndarray] = field(default_factory=dict)
     surface_points: SurfacePoints | None = None
+    worn: Mapping[str, WornSurface] = field(default_factory=dict)
 
     def shape(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
         """Return the body of shape parameters ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.

@@ -14,7 +14,14 @@ import numpy as np
 from scipy import sparse
 
 from piavatar_envs.avatar.body import closed_skin, sampling
-from piavatar_envs.avatar.body.asset import AvatarAsset, Look, PoseDisplacements, area_vectors, top_weights
+from piavatar_envs.avatar.body.asset import (
+    AvatarAsset,
+    Look,
+    PoseDisplacements,
+    WornSurface,
+    area_vectors,
+    top_weights,
+)
 from piavatar_envs.avatar.body.closed_skin import CELL, ClosedSkin, close_skin, distinct, read_soup, unique_rows
 from piavatar_envs.avatar.body.groups import on_skin
 from piavatar_envs.avatar.body.rigs import spread_weights
@@ -124,6 +131,7 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
     deltas = np.zeros((count, 2, len(skin.vertices), 3), np.float32)
     for parameter, half in np.ndindex(count, 2):
         deltas[parameter, half] = skin.anchors @ posed.shape_deltas[parameter, half]
+    look, drawn = _look(posed, flipped, part)
     return AvatarAsset(
         name=character.name,
         vertices=skin.vertices.astype(np.float32),
@@ -134,8 +142,9 @@ def body_of(character: Character, cell: float = CELL) -> AvatarAsset:
         shape_names=posed.shape_names,
         shape_deltas=deltas,
         shape_joints=np.asarray(posed.shape_joints, np.float32).reshape(count, 2, NUM_JOINTS, 3),
-        look=_look(posed, flipped, part),
+        look=look,
         groups=on_skin({**_named(posed), **posed.groups}, skin.anchors),
+        worn=_worn(posed, part, drawn),
     )
 
 
@@ -246,19 +255,51 @@ def _named(character: Character) -> dict[str, np.ndarray]:
     return groups
 
 
-def _look(posed: Character, flipped: np.ndarray, part: np.ndarray) -> Look:
-    """Return the surfaces of a posed character; those that are worn are drawn from both sides."""
+def _worn(posed: Character, part: np.ndarray, drawn: np.ndarray) -> dict[str, WornSurface]:
+    """Return the surfaces of a posed character that are worn, by name; equal names are one.
+
+    Args:
+        posed: the character.
+        part: what each of its triangles is, shape ``(T,)``.
+        drawn: its triangle that each one of the look is, shape ``(U,)``.
+    """
+    rows: dict[str, list[np.ndarray]] = {}
+    for surface in posed.surfaces:
+        own = surface.first + np.flatnonzero(part[surface.first : surface.last] == _WORN)
+        for name in {surface.name, surface.material} - {""}:
+            if len(own) and not surface.held:
+                rows.setdefault(name, []).append(own)
+    found = {}
+    for name, pieces in sorted(rows.items()):
+        own = np.unique(np.concatenate(pieces))
+        used, faces = np.unique(posed.faces[own], return_inverse=True)
+        found[name] = WornSurface(
+            posed.vertices[used].astype(np.float32),
+            faces.reshape(-1, 3).astype(np.int32),
+            None if posed.colors is None else np.ascontiguousarray(posed.colors[used], np.uint8),
+            np.flatnonzero(np.isin(drawn, own)).astype(np.int32),
+        )
+    return found
+
+
+def _look(posed: Character, flipped: np.ndarray, part: np.ndarray) -> tuple[Look, np.ndarray]:
+    """Return the surfaces of a posed character, and the triangle of the character that each one of the look is.
+
+    Those that are worn are drawn from both sides.
+    """
     faces = np.array(posed.faces, np.int32)
     faces[flipped] = faces[flipped, ::-1]
     shown = np.flatnonzero(part != _NONE)
     # across cells of a grid, triangles with few vertices would smear their textures over the seams
     textures = posed.textures if len(shown) <= MOST_DRAWN else None
-    faces, part = _coarser(posed.vertices, faces[shown], part[shown])
+    faces, rows = _coarser(posed.vertices, faces[shown], part[shown])
+    shown = shown[rows]
+    worn = part[shown] == _WORN
     outer, once = np.unique(faces, return_inverse=True)
-    inner, again = np.unique(faces[part == _WORN], return_inverse=True)
-    chosen = np.concatenate([outer, inner])
+    inner, again = np.unique(faces[worn], return_inverse=True)
+    chosen, drawn = np.concatenate([outer, inner]), np.concatenate([shown, shown[worn]])
     skin_joints, skin_weights = top_weights(np.maximum(posed.weights, 0.0)[chosen])
-    return Look(
+    look = Look(
         vertices=posed.vertices[chosen].astype(np.float32),
         faces=np.concatenate([once.reshape(-1, 3), again.reshape(-1, 3)[:, ::-1] + len(outer)]).astype(np.int32),
         skin_joints=skin_joints,
@@ -266,18 +307,19 @@ def _look(posed: Character, flipped: np.ndarray, part: np.ndarray) -> Look:
         colors=None if posed.colors is None else np.ascontiguousarray(posed.colors[chosen], np.uint8),
         shape_deltas=np.asarray(posed.shape_deltas, np.float32).reshape(-1, 2, len(posed.vertices), 3)[:, :, chosen],
         pose=None if posed.pose is None else PoseDisplacements(posed.pose.directions[chosen], posed.pose.reference),
-        textures=None if textures is None else textures.chosen(chosen, np.concatenate([shown, shown[part == _WORN]])),
+        textures=None if textures is None else textures.chosen(chosen, drawn),
     )
+    return look, drawn
 
 
 def _coarser(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return triangles between fewer vertices, and the part of each, where there are more than can be drawn swiftly.
+    """Return triangles between fewer vertices where there are more than can be drawn swiftly, and which ones they were.
 
     Of the vertices in a cell of a grid the one nearest to their mean stands for all (Rossignac & Borrel,
     "Multi-resolution 3D approximations for rendering complex scenes", 1993).
     """
     if len(faces) <= MOST_DRAWN:
-        return faces, part
+        return faces, np.arange(len(faces))
     area = np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()
     used = np.unique(faces)
     place = np.floor(vertices[used] / np.sqrt(2.0 * area / MOST_DRAWN)).astype(np.int64)
@@ -292,7 +334,7 @@ def _coarser(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple
     stand = np.zeros(len(vertices), np.int32)
     stand[used] = nearest[cell]
     rows = distinct(stand[faces])
-    return stand[faces[rows]], part[rows]
+    return stand[faces[rows]], rows
 
 
 def _check(character: Character) -> None:
