@@ -19,8 +19,8 @@ help:
 	@echo "make test-vlm      test the judge of agents.fit with a tiny vision-language model of transformers"
 	@echo "make test-rllib  test the ids and games with Ray's RLlib, also on two nodes of which one is killed"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
-	@echo "make lint      check style and format; 'make format' mends what can be mended"
-	@echo "make docs      write docs/envs/*.md from the code and build the site in build/site (PICTURES=1 draws the pages' pictures, too; CHECK=1 compares the pages only)"
+	@echo "make lint      check style, format and the types of the public API; 'make format' mends what can be mended"
+	@echo "make docs      write docs/envs/*.md from the code and build the site in build/site (PICTURES=1 draws the pages' pictures, too; CHECK=1 compares the pages only, LINKS=1 also visits the links to other sites)"
 	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
 
 install: $(STAMP)
@@ -106,6 +106,7 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m scripts.prose
+	$(BIN)/python -m scripts.check_types
 
 format: install
 	$(BIN)/ruff check --fix .
@@ -118,6 +119,7 @@ ifndef CHECK
 	$(BIN)/python -m benchmarks.report --out docs/report
 	$(BIN)/python -m sphinx -b html --fail-on-warning --keep-going --quiet docs build/site
 	@echo "built build/site/index.html"
+	$(if $(LINKS),$(BIN)/python -m sphinx -b linkcheck --keep-going --quiet docs build/links)
 endif
 
 $(VENV)/.docs: $(STAMP)
@@ -125,5 +127,5 @@ $(VENV)/.docs: $(STAMP)
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find . -name __pycache__ -type d -not -path './.*' -prune -exec rm -rf {} +

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 from functools import partial
-from pathlib import Path
 
 import pytest
 
 from piavatar_envs.avatar.body import sources
 from piavatar_envs.avatar.motion import library
 from piavatar_envs.config import ConfigError
+from scripts.page_code import PAGES, ROOT, blocks
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGES = {
-    page.relative_to(ROOT).as_posix(): page for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-}
 #: Code that takes minutes or a GPU, and its replacement here.
 SMALLER = {
     "for _ in range(150):": "for _ in range(3):",
@@ -37,11 +34,6 @@ SMALLER = {
 }
 
 
-def blocks(page: Path) -> list[str]:
-    """Return the Python blocks of a page."""
-    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
-
-
 def test_links_resolve():
     others = ("CONTRIBUTING.md", "CHANGELOG.md", "*/README.md", "docs/*/*.md", "benchmarks/results/*.md")
     pages = PAGES | {page.relative_to(ROOT).as_posix(): page for pattern in others for page in ROOT.glob(pattern)}
@@ -52,6 +44,28 @@ def test_links_resolve():
                 found += 1
                 assert (page.parent / target.partition("#")[0]).exists(), f"{name} links to {target}"
     assert found > 40
+
+
+def test_links_to_other_sites_are_well_formed():
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES.values())
+    links = re.findall(r"https?:[^)>\s\"'`]*", text)
+    assert (
+        len(links) > 20
+        and [link for link in links if not re.fullmatch(r"https://[\w-]+(\.[\w-]+)+(/[\w./%#~+-]*)?(?<![.,;:])", link)]
+        == []
+    )
+
+
+@pytest.mark.parametrize("repository", ["", "me/bodies"])
+def test_notebooks_open_in_colab(repository, monkeypatch):
+    pytest.importorskip("sphinx", reason="needs the extra docs")
+    monkeypatch.setenv("GITHUB_REPOSITORY", repository)
+    conf, source = runpy.run_path(str(ROOT / "docs/conf.py")), [(ROOT / "docs/quickstart.md").read_text("utf-8")]
+    conf["links_to_notebooks"](None, "quickstart", source)
+    found = re.findall(r"\((https://colab\.research\.google\.com/github/\S+)\)", source[0])
+    names = [notebook.name for notebook in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+    begin = f"https://colab.research.google.com/github/{repository}/blob/main/notebooks/"
+    assert sorted(found) == ([f"{begin}{name}" for name in names] if repository else [])
 
 
 def test_every_guide_is_in_the_site():
@@ -69,7 +83,7 @@ def test_committed_results_stay_small():
 
 
 def test_replacements_occur_in_the_pages():
-    code = "\n".join(block for page in PAGES.values() for block in blocks(page))
+    code = "\n".join(block.code for page in PAGES.values() for block in blocks(page))
     assert [text for text in SMALLER if text not in code] == []
 
 
@@ -79,27 +93,28 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
     sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra train")
     for needed in ("skrl", "rsl_rl", "pettingzoo"):
         pytest.importorskip(needed, reason="needs the extras skrl, rsl and multi")
-    if "deepmimic:" in "".join(blocks(PAGES[name])):
+    page = blocks(PAGES[name])
+    if any("deepmimic:" in block.code for block in page):
         pytest.importorskip("pybullet", reason="needs the extra motions")
-    if "import ray" in "".join(blocks(PAGES[name])):
-        pytest.importorskip("ray", reason="needs RLlib: make test-rllib")
+    for module, target in (("ray", "test-rllib"), ("torchrl", "clients-light")):
+        if any(re.search(rf"^(import|from) {module}\b", block.code, re.M) for block in page):
+            pytest.importorskip(module, reason=f"needs {module}: make {target}")
     monkeypatch.chdir(ROOT)
     for module in (sources, library):  # what a page registers ends with it
         monkeypatch.setattr(module, "_registered", dict(module._registered))
     monkeypatch.setattr(sb3, "PPO", partial(sb3.PPO, n_steps=8, batch_size=8))
     monkeypatch.syspath_prepend(tmp_path)
-    saved = re.findall(r"[Ss]ave this as\s`([\w.]+)`", PAGES[name].read_text(encoding="utf-8"))
-    code = blocks(PAGES[name])
-    for file, block in zip(saved, code, strict=False):
-        (tmp_path / file).write_text(block, encoding="utf-8")
     space = {"DEVICE": device, "FOLDER": tmp_path, "__name__": name}
-    for block in code[len(saved) :]:
-        if block.startswith(">>>"):
-            check_refusals(block, space)
-            continue
-        for text, small in SMALLER.items():
-            block = block.replace(text, small)
-        exec(compile(block, name, "exec"), space)
+    for block in page:
+        code = block.code
+        if block.file:
+            (tmp_path / block.file).write_text(code, encoding="utf-8")
+        elif block.session:
+            check_refusals(code, space)
+        else:
+            for text, small in SMALLER.items():
+                code = code.replace(text, small)
+            exec(compile(code, name, "exec"), space)
 
 
 def check_refusals(block: str, space: dict) -> None:

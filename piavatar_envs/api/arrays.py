@@ -25,6 +25,7 @@ class ArrayApi(Protocol):
     """
 
     name: str
+    device: Any  # in the words of the library
 
     def read(self, arrays: Sequence[wp.array]) -> Array:
         """Copy the arrays, one after the other."""
@@ -157,6 +158,7 @@ class NumpyArrays:
     """Arrays on the host, whatever the device."""
 
     name = "numpy"
+    device = "cpu"
 
     def read(self, arrays: Sequence[wp.array]) -> np.ndarray:
         """Copy the arrays, one after the other."""

@@ -420,7 +420,7 @@ class WriteMonitor:
             names = [f"{term.name}[{index}]" for term in task.terms() for index in range(term.size)]
             self._note(env, graph, env.observation, names, start, range(agent, agent + 1))
 
-        task.allocate, task.record_outcome, task.record_observe = lengthen, outcome, observe
+        vars(task).update(allocate=lengthen, record_outcome=outcome, record_observe=observe)
 
     def _with_spare(self, name: str, array: wp.array) -> wp.array:
         """Return an array like ``array`` with spare numbers behind it; contiguous, so that tasks can reshape it."""
@@ -469,6 +469,6 @@ def note_columns(
     found: wp.array(dtype=int),
 ):
     """Note columns from ``start`` on that are not finite, of agents from ``agent`` on, where nothing has failed."""
-    e, a, n = wp.tid()
+    e, a, n = wp.tid()  # type: ignore[misc]
     if failure[e] == 0 and not wp.isfinite(values[e, agent + a, start + n]):
         wp.atomic_max(found, n, 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -35,7 +35,8 @@ class AvatarEnv(SingleView, gym.Env):
         action_names: of every component of the action.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 30}
+    # no ClassVar, because Gymnasium declares it of the instance
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 30}  # noqa: RUF012
 
     def __init__(
         self,
@@ -67,7 +68,7 @@ class AvatarEnv(SingleView, gym.Env):
         task_class = load_registered(task, registered)
         settings = load_keywords(task_class.Config, config, overrides)
         settings = limited(settings, "max_episode_steps", max_episode_steps)
-        made = {"task": task_class, "render_mode": render_mode, "device": device, "config": settings}
+        made: dict[str, Any] = {"task": task_class, "render_mode": render_mode, "device": device, "config": settings}
         self._build = partial(AvatarEnv.__init__, **made)
         self.config, self.render_mode, self._over = settings, check_render_mode(render_mode), False
         self.host = EpisodeHost(task_class(settings).alone(), 1, device, render_mode=render_mode)

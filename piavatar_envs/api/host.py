@@ -172,7 +172,7 @@ class EpisodeHost:
             return flat
         if mode == "dict":
             return gym.spaces.Dict({name: _unbounded(term.size) for name, term in self.layout.items()})
-        spaces = picture_spaces(self.config.pixels)
+        spaces: dict[str, gym.Space[Any]] = {**picture_spaces(self.config.pixels)}
         if mode == "pixels":
             return gym.spaces.Dict(spaces) if len(spaces) > 1 else spaces["pixels"]
         return gym.spaces.Dict(spaces | {"state": flat})
@@ -351,7 +351,7 @@ class EpisodeHost:
 
     def observed_pictures(self, agent: int) -> dict[str, Array]:
         """Return the pictures that an agent observes, ``(num_envs, height, width, channels)`` by name; or none."""
-        return {name: self.read(lambda group, name=name: group.pixels.arrays[name][agent]) for name in self._seen}
+        return {name: self.read(functools.partial(_picture, name=name, agent=agent)) for name in self._seen}
 
     def named(self, observation: Array, pictures: Mapping[str, Array] | None = None) -> dict[str, Array] | Array:
         """Return an observation in the form that ``obs_mode`` has.
@@ -360,14 +360,14 @@ class EpisodeHost:
             observation: flat along its last axis.
             pictures: that belong to it, by name.
         """
-        mode = self.config.obs_mode
+        mode, seen = self.config.obs_mode, dict(pictures or {})
         if mode == "dict":
             return self.api.split(observation, self.layout)
         if mode == "flat":
             return observation
         if mode == "pixels":
-            return dict(pictures) if len(pictures) > 1 else pictures["pixels"]
-        return {**pictures, "state": observation}
+            return seen if len(seen) > 1 else seen["pixels"]
+        return {**seen, "state": observation}
 
     def reward(self) -> Array:
         """Return the reward of the last step, ``(num_envs, num_agents)`` float32."""
@@ -426,7 +426,7 @@ class EpisodeHost:
 
         def named(names: Sequence[str], prefix: str, array_of: Callable[[BatchEnv], wp.array]) -> dict[str, Array]:
             # an array without names has one column without meaning
-            values = self.read(array_of)[:, agent] if names else None
+            values = self.read(array_of)[:, agent] if names else np.empty((0, 0))
             return {f"{prefix}{name}": values[:, index] for index, name in enumerate(names)}
 
         task = self.task
@@ -516,7 +516,8 @@ class EpisodeHost:
         mask, force = self.api.mask(envs, self.num_envs), self.api.vectors("force", force, self.num_envs)
         at = force if point is None else self.api.vectors("point", point, self.num_envs)
         if self.api.name == "numpy" and self.groups[0].simulation.forces:
-            taken = self.read(lambda group: group.simulation.forces.slots.remaining) > 0
+            forces = [group.simulation.forces for group in self.groups if group.simulation.forces]
+            taken = self.api.read([one.slots.remaining for one in forces]) > 0
             full = np.flatnonzero(taken.all(1) & mask)
             if full.size:
                 raise ValueError(
@@ -524,7 +525,7 @@ class EpisodeHost:
                     "use fewer, or fewer steps"
                 )
         self._enable_forces()
-        calls = [group.simulation.forces.call for group in self.groups]
+        calls = [group.simulation.forces.call for group in self.groups if group.simulation.forces]
         for name, values in (("mask", mask), ("force", force), ("point", at)):
             self.api.write(values, [getattr(call, name) for call in calls])
         self.api.begin()
@@ -873,6 +874,12 @@ def checked_seed(seed: Any) -> int:
         check_seeds(seed)  # first, because Gymnasium raises its own Error for a negative one
     seeding.np_random(seed)
     return seed
+
+
+def _picture(group: BatchEnv, name: str, agent: int) -> wp.array:
+    """Return the pictures that an agent of a group observes, ``(num_envs, height, width, channels)``."""
+    assert group.pixels is not None
+    return group.pixels.arrays[name][agent]
 
 
 def _unbounded(size: int) -> gym.spaces.Box:

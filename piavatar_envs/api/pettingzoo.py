@@ -72,7 +72,13 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
         """
         task_class = load_task(task)
         self.config = limited(load_keywords(task_class.Config, config, overrides), "max_cycles", max_cycles)
-        made = {"task": task_class, "render_mode": render_mode, "device": device, "config": self.config, "name": name}
+        made: dict[str, Any] = {
+            "task": task_class,
+            "render_mode": render_mode,
+            "device": device,
+            "config": self.config,
+            "name": name,
+        }
         self._build = partial(AvatarParallelEnv.__init__, **made)
         self.render_mode = check_render_mode(render_mode)
         self.host = EpisodeHost(task_class(self.config), 1, device, render_mode=render_mode)

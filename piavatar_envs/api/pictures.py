@@ -27,11 +27,15 @@ from piavatar_envs.sim.forces import Target
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+    from piavatar_envs.avatar.skin import Skin
+    from piavatar_envs.avatar.types import Body as MovedBody
     from piavatar_envs.envs.pixels import PixelObserver
     from piavatar_envs.render import Arrow, Body, Marker, MovedSplats, Scene
     from piavatar_envs.render.live import Drag, LiveView
     from piavatar_envs.render.stage import Stage
     from piavatar_envs.sim.markers import MarkerSpec
+    from piavatar_envs.sim.prop_surface import SolidSurface
+    from piavatar_envs.sim.props import Prop
 
 #: Render modes of one environment, and of a batch: a live view shows one.
 RENDER_MODES = ("rgb_array", "human")
@@ -148,12 +152,13 @@ class SceneReader:
         if color == "skin" or (color == "impulse" and index >= avatars):
             return body
         if index < avatars:
-            matter, surface = simulation.avatars[index].body, self.stage.skins[index]
+            matter: MovedBody | Prop = simulation.avatars[index].body
+            surface: Skin | SolidSurface = self.stage.skins[index]
         else:
             matter, surface = simulation.props.props[index - avatars], self.stage.solids[index - avatars]
         own, scale = slice(matter.first, matter.first + matter.count), QUANTITIES[color]
         values, splats = of_particles(simulation, env, own, color), body.splats
-        if splats is not None:
+        if splats is not None and self.stage.splats is not None:
             of_splats = self.stage.splats.bound[index].skin.interpolate(values)
             splats = replace(splats, colors=color_by(of_splats, scale.maximum))
         scalars = surface.interpolate(values)
@@ -369,7 +374,7 @@ def grip_at(batch: BatchEnv, env: int, drag: Drag) -> Grip | None:
     simulation = batch.simulation
     avatars, props = simulation.avatars, simulation.props
     worn = drag.body - len(avatars) - len(props.props)
-    if worn >= 0:
+    if worn >= 0 and simulation.garments is not None:
         wearer = simulation.garments.garments[worn].wearer
         if wearer < 0:
             return None
@@ -442,7 +447,7 @@ class MouseForce:
         """Return an arrow from the grabbed point to the mouse, if something is dragged."""
         from piavatar_envs.render import Arrow
 
-        if self._grip is None:
+        if self._grip is None or self._drag is None:
             return None
         point = self._grip.point(self._env)
         return Arrow(point, self._drag.end - point)

@@ -79,9 +79,14 @@ class AvatarRslEnv(HostView, VecEnv):
         task_class = load_task(task)
         self.config = load_keywords(task_class.Config, config, overrides)
         # a copy is built by _make, which begins no episodes
-        made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
+        made: dict[str, Any] = {
+            "num_envs": num_envs,
+            "device": device,
+            "num_threads": num_threads,
+            "config": self.config,
+        }
         self._build = partial(AvatarRslEnv._make, task=task_class, **made)
-        self._build(self)
+        self._make(task_class, **made)
         self.num_envs, self.num_actions = num_envs, self.host.action_size
         self.device = self.host.api.device
         self.max_episode_length = self.host.groups[0].max_steps
@@ -96,7 +101,7 @@ class AvatarRslEnv(HostView, VecEnv):
     def _checked_groups(self, groups: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
         layout = self.host.layout
         if groups is None:
-            by_term = {name: (name,) for name in layout}
+            by_term: dict[str, tuple[str, ...]] = {name: (name,) for name in layout}
             return {"dict": by_term, "pixels": {}}.get(self.config.obs_mode, {"policy": tuple(layout)})
         taken = self.host.observed_pictures(0)
         for group, names in groups.items():

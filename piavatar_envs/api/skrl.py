@@ -75,7 +75,12 @@ class AvatarSkrlEnv(HostView):
         """
         task_class = load_task(task)
         self.config = load_keywords(task_class.Config, config, overrides)
-        made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
+        made: dict[str, Any] = {
+            "num_envs": num_envs,
+            "device": device,
+            "num_threads": num_threads,
+            "config": self.config,
+        }
         self._build = partial(AvatarSkrlEnv.__init__, task=task_class, **made)
         self.host = EpisodeHost(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
         self.num_envs, self.device = num_envs, self.host.api.device
@@ -191,7 +196,12 @@ class AvatarSkrlMultiEnv(HostView):
         """
         task_class = load_task(task)
         self.config = load_keywords(task_class.Config, config, overrides)
-        made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
+        made: dict[str, Any] = {
+            "num_envs": num_envs,
+            "device": device,
+            "num_threads": num_threads,
+            "config": self.config,
+        }
         self._build = partial(AvatarSkrlMultiEnv.__init__, task=task_class, **made)
         self.host = EpisodeHost(task_class(self.config), num_envs, device, "torch", num_threads)
         self.num_envs, self.device = num_envs, self.host.api.device

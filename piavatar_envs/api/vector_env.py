@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -40,12 +40,17 @@ class VectorCalls:
         host: holds the environments.
         num_envs: number of environments.
         _own: names of the attributes that the vector was built with.
+        reset, render, set_state, assist_root: methods of the vector.
     """
 
     config: EnvConfig
     host: EpisodeHost
     num_envs: int
     _own: frozenset[str]
+    reset: Callable[..., tuple[Any, dict[str, Any]]]
+    render: Callable[[], tuple[Any, ...] | None]
+    set_state: Callable[[dict[str, np.ndarray]], Any]
+    assist_root: Callable[[Any], None]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each: reset, render, read, get_state, set_state, assist_root or apply_force.
@@ -113,7 +118,11 @@ class VectorCalls:
 
     def call_some(self, envs: Sequence[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Call a method as :meth:`call` does, for each of ``envs``; the others go on."""
-        own = {"reset": self._reset_some, "get_state": self._states, "set_state": self._set_states}
+        own: dict[str, Callable[..., list[Any]]] = {
+            "reset": self._reset_some,
+            "get_state": self._states,
+            "set_state": self._set_states,
+        }
         own |= {"render": self._frames, "assist_root": self._assist_some, "apply_force": self._push_some}
         own |= {"read": self._read_some}
         if name in own:
@@ -211,7 +220,8 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         action_names: of every component of an action.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    # no ClassVar, because Gymnasium declares it of the instance
+    metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": list(BATCH_RENDER_MODES),
         "render_fps": 30,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -256,11 +266,16 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         task_class = load_registered(task, registered)
         settings = load_keywords(task_class.Config, config, overrides)
         self.config = limited(settings, "max_episode_steps", max_episode_steps)
-        made = {"num_envs": num_envs, "render_mode": render_mode, "device": device, "array_api": array_api}
+        made: dict[str, Any] = {
+            "num_envs": num_envs,
+            "render_mode": render_mode,
+            "device": device,
+            "array_api": array_api,
+        }
         made |= {"autoreset_mode": self.autoreset_mode, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarVectorEnv.__init__, task=task_class, **made)
-        task = task_class(self.config).alone()
-        self.host = EpisodeHost(task, num_envs, device, array_api, num_threads, render_mode)
+        alone = task_class(self.config).alone()
+        self.host = EpisodeHost(alone, num_envs, device, array_api, num_threads, render_mode)
         self.num_envs = num_envs
         frame_rate = self.host.frame_rate
         self.metadata = {**self.metadata, "render_fps": frame_rate, "autoreset_mode": self.autoreset_mode}
@@ -293,7 +308,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         """
         mask = self._reset_mask(options)
         self.host.reset(seed, mask)
-        if mask is not None:
+        if options and mask is not None:
             del options["reset_mask"]  # after the reset, so that a refused call changes nothing
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         held = None if mask is None else self.host.api.from_host(mask)

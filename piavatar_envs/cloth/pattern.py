@@ -106,16 +106,17 @@ class Sector:
         """
         radius = girth / (2.0 * np.pi * flare)
         start, end = span or (0.0, 2.0 * np.pi)
-        polar, rows = [], []
+        rings: list[np.ndarray] = []
+        rows: list[np.ndarray] = []
         for index, at in enumerate(np.linspace(radius, radius + length, max(1, round(length / (edge * ROW))) + 1)):
             count = max(8, round((end - start) * flare * at / edge))
             steps = np.arange(count) + 0.5 * (index % 2)
             if span is not None:
                 steps = np.concatenate([[0.0], steps[steps > 0.0], [count]])
             angle = first if index == 0 and first is not None else start + (end - start) * steps / count
-            rows.append(sum(map(len, rows)) + np.arange(len(angle)))
-            polar.append(np.stack([np.full(len(angle), at), angle], axis=1))
-        polar = np.concatenate(polar)
+            rows.append(sum(len(row) for row in rows) + np.arange(len(angle)))
+            rings.append(np.stack([np.full(len(angle), at), angle], axis=1))
+        polar = np.concatenate(rings)
         faces = [between(upper, lower, polar[:, 1], span is None) for upper, lower in pairwise(rows)]
         return Sector(radius, flare, polar, np.concatenate(faces), tuple(rows))
 

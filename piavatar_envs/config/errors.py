@@ -128,24 +128,24 @@ class _Place:
     @property
     def field(self) -> FieldInfo | None:
         """The setting itself, or None where the model has none of that name."""
-        return self.model.model_fields.get(self.rest[0]) if self.rest else None
+        return self.model.model_fields.get(str(self.rest[0])) if self.rest else None
 
 
 def _locate(cls: type[BaseModel], loc: Sequence[str | int]) -> _Place:
     """Follow ``loc`` from ``cls`` through sections, unions of them and lists of them."""
     model, depth, entry, union = cls, 0, 0, None
     parts: list[str] = []
-    while depth < len(loc) and loc[depth] in model.model_fields:
-        field, below = model.model_fields[loc[depth]], loc[depth + 1] if depth + 1 < len(loc) else None
+    while depth < len(loc) and (name := str(loc[depth])) in model.model_fields:
+        field, below = model.model_fields[name], loc[depth + 1] if depth + 1 < len(loc) else None
         variants, item = variants_of(field), entry_of(field.annotation)
         if item and isinstance(below, int):
-            parts += [str(loc[depth]), str(below)]
+            parts += [name, str(below)]
             model, depth, entry, union = item, depth + 2, len(parts), None
         elif variants and below in variants:
-            parts.append(str(loc[depth]))
+            parts.append(name)
             model, depth, union = variants[below], depth + 2, (".".join(parts), field)
         elif section := section_of(field.annotation):
-            parts.append(str(loc[depth]))
+            parts.append(name)
             model, depth, union = section, depth + 1, None
         else:
             break
@@ -198,7 +198,7 @@ def _unit(place: _Place) -> str:
 
 def _unknown_key(cls: type[BaseModel], place: _Place, value: Any) -> str:
     """Say that there is no such setting, and name a close one; in an entry of a list, one of the entry's own."""
-    if place.union and (line := _other_variant(place, value)):
+    if line := _other_variant(place, value):
         return line
     held = place.model if place.entry else cls  # of all sections: the setting may be in another one
     key, names = place.key.removeprefix(place.entry), setting_keys(held)
@@ -217,6 +217,8 @@ def _unknown_key(cls: type[BaseModel], place: _Place, value: Any) -> str:
 
 def _other_variant(place: _Place, value: Any) -> str | None:
     """Say which variants of a union have the setting; None if none has it."""
+    if place.union is None:
+        return None
     name, field = place.union
     variants = variants_of(field)
     tags = [tag for tag, model in variants.items() if place.rest[0] in model.model_fields]

@@ -208,11 +208,12 @@ def _count(node: yaml.Node, counted: dict[yaml.Node, int | None]) -> int:
         yaml.YAMLError: there are too many, or a node holds itself.
     """
     if node in counted:
-        if counted[node] is None:
+        total = counted[node]
+        if total is None:
             raise yaml.constructor.ConstructorError(
                 None, None, "a value holds itself; write it out instead of by an alias", node.start_mark
             )
-        return counted[node]
+        return total
     counted[node], total = None, 1
     if isinstance(node, yaml.MappingNode):
         total += sum(_count(part, counted) for pair in node.value for part in pair)
@@ -371,7 +372,7 @@ def _without_replaced_variants(
 
 def _variant(field: FieldInfo, settings: Mapping[str, Any]) -> type[BaseModel] | None:
     """Return the model that ``settings`` choose from a union, by default that of the field's default; None for none."""
-    tag = settings.get(field.discriminator, ...)
+    tag = settings.get(str(field.discriminator), ...)
     if tag is ...:
         return type(field.get_default(call_default_factory=True))
     return variants_of(field).get(tag) if isinstance(tag, str) else None

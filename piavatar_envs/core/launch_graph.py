@@ -46,7 +46,7 @@ class Launch:
 
     def recorded(self, device: wp.Device) -> Callable[[], None]:
         """Return a callable that makes the launch; compiles the kernel if needed."""
-        arguments = {"inputs": self.inputs, "outputs": self.outputs, "block_dim": self.block_dim}
+        arguments: dict[str, Any] = {"inputs": self.inputs, "outputs": self.outputs, "block_dim": self.block_dim}
         return wp.launch(self.kernel, self.dim, **arguments, device=device, record_cmd=True).launch
 
 
@@ -329,9 +329,9 @@ def _shown(loads: Sequence[Future]) -> Iterator[Future]:
     )
 
 
-def _can_branch(device: wp.Device) -> bool:
+def _can_branch(device: wp.Device | None) -> bool:
     """Return whether captured graphs support conditions on the device."""
-    return device.is_cpu or wp.is_conditional_graph_supported()
+    return wp.get_device(device).is_cpu or wp.is_conditional_graph_supported()
 
 
 def available_cores() -> int:

@@ -103,8 +103,8 @@ def write_rotation(observation: wp.array3d(dtype=float), e: int, agent: int, sta
     x = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
     y = wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0))
     for n in range(3):
-        observation[e, agent, start + n] = x[n]
-        observation[e, agent, start + 3 + n] = y[n]
+        observation[e, agent, start + n] = x[n]  # type: ignore[index]
+        observation[e, agent, start + 3 + n] = y[n]  # type: ignore[index]
 
 
 @wp.func

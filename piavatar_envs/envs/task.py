@@ -162,6 +162,7 @@ class Task:
     camera_target: tuple[float, float, float] | None = None
     camera_follows: bool = True
     motion_names: tuple[str, ...] = ()
+    motion_shares: wp.array
 
     reward_names: ClassVar[tuple[str, ...]] = ()
     cost_names: ClassVar[tuple[str, ...]] = ()
@@ -367,7 +368,7 @@ class Task:
         Raises:
             ValueError: an array of another type, such as bool.
         """
-        found = []
+        found: list[wp.array] = []
         for declared in self._declared_arrays():
             if declared.cleared:
                 array = getattr(self, declared.name)

@@ -8,7 +8,7 @@ import pkgutil
 import re
 from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeGuard
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.task import Task
@@ -110,7 +110,7 @@ def load_task(task: str | type[Task]) -> type[Task]:
             raise ValueError(
                 f"task={task!r} has several agents: use piavatar_envs.multi.{name}.parallel_env(), or its TASK"
             )
-        raise ValueError(f"unknown task {task!r}; {instead_of(task, [*modules, *_added])}")
+        raise ValueError(f"unknown task {task!r}; {instead_of(str(task), [*modules, *_added])}")
     return load_task(_added[full])
 
 
@@ -164,7 +164,7 @@ def _stem(name: str) -> str:
     return _VERSION.sub("", re.split(r"[/:.]", name)[-1]).replace("_", "").lower()
 
 
-def _is_task(task: object) -> bool:
+def _is_task(task: object) -> TypeGuard[type[Task]]:
     if not isinstance(task, type):
         return False
     from piavatar_envs.envs.task import Task  # a subclass exists, so this is imported already

@@ -87,6 +87,8 @@ class Look:
 
     @cached_property
     def _colorings(self) -> tuple[np.ndarray, ...]:
+        if self.colors is None:
+            return ()
         return (self.colors,) if self.colors.ndim == 2 else tuple(self.colors)
 
 

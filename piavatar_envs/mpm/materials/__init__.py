@@ -11,9 +11,11 @@ import importlib
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,7 +31,7 @@ class Material:
     """
 
     name: str
-    kirchhoff_stress: wp.Function
+    kirchhoff_stress: Callable[..., Any]
     energy: Callable[[np.ndarray, float, float], np.ndarray]
 
 
@@ -52,7 +54,7 @@ MATERIALS: dict[str, Material] = _own_materials()
 _OWN = frozenset(MATERIALS)
 
 
-def _otherwise(stress: wp.Function) -> wp.Function:
+def _otherwise(stress: Callable[..., wp.mat33]) -> Callable[..., wp.mat33]:
     """Return a dispatch function that evaluates one material for any index."""
 
     @wp.func(name="kirchhoff_stress_otherwise")
@@ -62,7 +64,7 @@ def _otherwise(stress: wp.Function) -> wp.Function:
     return otherwise
 
 
-def _choice(index: int, stress: wp.Function, others: wp.Function) -> wp.Function:
+def _choice(index: int, stress: Callable[..., wp.mat33], others: Callable[..., wp.mat33]) -> Callable[..., wp.mat33]:
     """Return a dispatch function that evaluates the material ``index``, and ``others`` for the rest."""
 
     @wp.func(name=f"kirchhoff_stress_{index}")
@@ -74,7 +76,7 @@ def _choice(index: int, stress: wp.Function, others: wp.Function) -> wp.Function
     return choice
 
 
-def _dispatch() -> wp.Function:
+def _dispatch() -> Callable[..., wp.mat33]:
     """Return the dispatch over all materials."""
     stress = _otherwise(MATERIALS[DEFAULT].kirchhoff_stress)
     for index, (name, material) in enumerate(MATERIALS.items()):
@@ -93,7 +95,7 @@ def kirchhoff_stress(material: int, F: wp.mat33, mu: float, lam: float):
 
 
 def register_material(
-    name: str, kirchhoff_stress: wp.Function, energy: Callable[[np.ndarray, float, float], np.ndarray]
+    name: str, kirchhoff_stress: Callable[..., Any], energy: Callable[[np.ndarray, float, float], np.ndarray]
 ) -> None:
     """Make a material available to settings and to :class:`piavatar_envs.mpm.model.MaterialPoints`.
 
@@ -150,21 +152,21 @@ def check_material(name: str) -> str:
     return name
 
 
-def lame_parameters(young_modulus, poisson_ratio):
+def lame_parameters(young_modulus: ArrayLike, poisson_ratio: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return shear modulus and first Lame parameter [Pa] from Young's modulus [Pa] and Poisson's ratio.
 
     Raises:
         ValueError: Poisson's ratio is not in [0, 0.5), or the modulus is negative.
     """
-    young_modulus, poisson_ratio = np.asarray(young_modulus, float), np.asarray(poisson_ratio, float)
-    bad = poisson_ratio[~((poisson_ratio >= 0.0) & (poisson_ratio < 0.5))]
+    E, nu = np.asarray(young_modulus, float), np.asarray(poisson_ratio, float)
+    bad = nu[~((nu >= 0.0) & (nu < 0.5))]
     if bad.size:
         raise ValueError(f"poisson_ratio={bad[0]:g} must be in [0, 0.5): at 0.5 the solid is incompressible")
-    bad = young_modulus[~(young_modulus >= 0.0)]
+    bad = E[~(E >= 0.0)]
     if bad.size:
         raise ValueError(f"young_modulus={bad[0]:g} Pa must not be negative")
-    mu = young_modulus / (2.0 * (1.0 + poisson_ratio))
-    lam = young_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
+    mu = E / (2.0 * (1.0 + nu))
+    lam = E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
     return mu, lam
 
 
