@@ -235,21 +235,14 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
         ImportError: the extra ``live`` is not installed.
         ValueError: an unknown device, or a port out of range.
     """
-    from piavatar_envs.render.live import check_port, import_viser
-    from piavatar_envs.watch import watch_env
+    from agents.live import policy_kind
+    from piavatar_envs.live.agents import agent_kinds
+    from piavatar_envs.live.setup import Setup
+    from piavatar_envs.watch import watch_setup
 
-    check_port(options.port)
-    import_viser()  # before the kernels are compiled, not after
-    first = first_seed(run, options)
-    made = EnvFactory(run.env_id, env, options.device)()
-    agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
-    watch_env(
-        made,
-        lambda seen: act_alone(agent, seen),
-        first,
-        options.port,
-        lambda: begin_round(agent, 1),
-    )
+    name = options.run.name
+    setup = Setup(run.env_id, {"config": env}, name, seed=first_seed(run, options), device=options.device)
+    watch_setup(setup, {**agent_kinds(run.env_id), name: policy_kind(run)}, options.port)
 
 
 def act_alone(agent: Agent, observation: Seen) -> np.ndarray:

@@ -120,28 +120,46 @@ def play_command(
 
 
 def watch_command(
-    env_id: EnvId,
-    agent: AgentName = "random",
+    env_id: EnvId = "",
+    agent: Annotated[
+        str, tyro.conf.arg(help="random, zero, clip:NAME, or from a clone pid or the folder of a training")
+    ] = "random",
+    num_envs: Annotated[int, tyro.conf.arg(help="environments, of which the browser shows one")] = 1,
     seed: Seed = 0,
     device: Device = "cpu",
     port: Annotated[int, tyro.conf.arg(help="of this machine, or the next one that is free")] = 8080,
+    scene: Annotated[Path | None, tyro.conf.arg(help="go on with a scene that was saved in a live view")] = None,
+    scenes: Annotated[Path, tyro.conf.arg(help="folder of the scenes that browsers save")] = Path("runs/scenes"),
     avatar: AvatarFile = None,
     config: Overrides = (),
 ) -> None:
     """Play an environment for ever, live in a web browser, until Ctrl-C (needs the extra live).
 
     Args:
-        env_id: the environment, e.g. PIAvatar/Reach-v0.
-        agent: random or zero actions.
+        env_id: the environment, e.g. PIAvatar/Reach-v0; none with --scene.
+        agent: which agent plays at first.
+        num_envs: number of environments.
         seed: seed of the run.
         device: where to simulate.
         port: of the view.
+        scene: file of a scene.
+        scenes: folder of saved scenes.
         avatar: the body, instead of the package's own.
         config: overrides of the environment's configuration.
     """
     from piavatar_envs import watch
 
-    watch.watch(env_id, agent, seed, device, port, prepare(env_id, config, avatar))
+    if scene is not None:
+        if env_id or config or avatar:
+            raise ValueError("a scene has its own environment and settings; leave out ID, -c and --avatar")
+        from piavatar_envs import doctor
+
+        doctor.quiet_warp()
+        watch.watch_scene(scene, device, port, scenes)
+        return
+    if not env_id:
+        raise ValueError("give the ID of an environment, as piavatar_envs list shows them, or --scene FILE")
+    watch.watch(env_id, agent, seed, device, port, prepare(env_id, config, avatar), num_envs, scenes)
 
 
 def export_command(

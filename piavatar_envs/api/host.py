@@ -483,6 +483,19 @@ class EpisodeHost:
         for group, part in zip(self.groups, parts, strict=True):
             group.assist_root(part)
 
+    @_alone
+    def tune(self, values: Mapping[str, float]) -> None:
+        """Change settings of all running worlds, by name; see :class:`~piavatar_envs.sim.tuning.Tuning`.
+
+        States do not hold these changes, and :attr:`config` stays that of the beginning.
+
+        Raises:
+            ValueError: a value is out of range, or needs environments of its own; nothing has changed then.
+        """
+        for group in self.groups:
+            group.tune(values)
+        self._captured.discard(BatchEnv.step)  # steps may have new graphs
+
     def weigh_motions(self, weights: Any) -> None:
         """Set the weights by which episodes draw their motions; see :meth:`HostView.weigh_motions`.
 

@@ -400,31 +400,35 @@ def grip_at(batch: BatchEnv, env: int, drag: Drag) -> Grip | None:
 
 
 class MouseForce:
-    """Spring that pulls a grabbed point of a bone or prop to the mouse.
+    """Spring that pulls a grabbed point of a bone or prop to a mouse.
 
     Its stiffness is that of the mass that moves, at natural frequency :data:`DRAG_RATE`. Its damper is critical for the
     grabbed bone alone, because the force is constant during a control step, in which a stronger one would turn a light
     limb around.
+
+    Attributes:
+        force: in the last control step [N], shape ``(3,)``.
     """
 
-    def __init__(self, batch: BatchEnv, env: int, push: Callable[..., None]) -> None:
+    def __init__(self, batch: BatchEnv, env: int, push: Callable[..., None], number: int | None = None) -> None:
         """Drag nothing yet.
 
         Args:
             batch: holds the environment.
             env: its index.
-            push: ``apply_force`` of a view of the batch.
+            push: ``apply_force`` of a view of the environments.
+            number: index of the environment there; ``env`` if not given.
         """
         self._batch, self._env, self._push = batch, env, push
+        self._number = env if number is None else number
+        self.force = np.zeros(3)
         self._drag: Drag | None = None
         self._grip: Grip | None = None
         self._before: np.ndarray | None = None  # the grabbed point before the last control step [m]
 
-    def apply(self, drag: Drag | None) -> None:
-        """Let the force of a drag act in the next control step; none without a drag."""
-        if drag is None:
-            self._drag = self._grip = None
-            return
+    def apply(self, drag: Drag) -> None:
+        """Let the force of a drag act in the next control step."""
+        self.force = np.zeros(3)
         if self._drag is None or drag.start is not self._drag.start:
             self._grip = grip_at(self._batch, self._env, drag)
             self.settle()
@@ -437,7 +441,8 @@ class MouseForce:
         self._before = point
         force = grip.mass * DRAG_RATE**2 * (drag.end - point) - 2.0 * grip.own_mass * DRAG_RATE * velocity
         force *= min(1.0, MOST_DRAG * grip.mass / max(float(np.linalg.norm(force)), 1e-9))
-        self._push(grip.name, force, point, agent=grip.agent, envs=self._env)
+        self.force = force
+        self._push(grip.name, force, point, agent=grip.agent, envs=[self._number])
 
     def settle(self) -> None:
         """Take what is grabbed to be at rest, because it was placed."""
@@ -489,14 +494,24 @@ class Live:
 
         import_viser()  # so that a missing library is reported before the first reset
         self.color, self.pace = color, pace or Pace()
-        self._batch, self._port, self._env = batch, PORT if port is None else port, env
-        self._progress, self._scenes, self._mouse = (
-            Progress(batch, env),
-            SceneReader(batch),
-            MouseForce(batch, env, push),
-        )
+        self._port = PORT if port is None else port
         self._view: LiveView | None = None
         self._shown, self._behind = 0.0, False
+        self.select(batch, push, env)
+
+    def select(self, batch: BatchEnv, push: Callable[..., None], env: int = 0, number: int | None = None) -> None:
+        """Show another environment from the next scene on.
+
+        Args:
+            batch: holds the environment.
+            push: ``apply_force`` of a view of it, by which mice pull.
+            env: index of the environment in the batch.
+            number: its index in ``push``; ``env`` if not given.
+        """
+        self._batch, self._env, self._push = batch, env, push
+        self._number = env if number is None else number
+        self._progress, self._scenes = Progress(batch, env), SceneReader(batch)
+        self._mice: dict[int, MouseForce] = {}
 
     @property
     def view(self) -> LiveView:
@@ -515,14 +530,31 @@ class Live:
 
     def begin(self) -> None:
         """Show the scene after a reset, and begin a control step now."""
-        self._mouse.settle()
+        for mouse in self._mice.values():
+            mouse.settle()
         self.show()
         self.pace.begin()
 
     def before_step(self) -> None:
-        """Let the mouse pull at what it drags, in the control step that follows."""
-        if self._view is not None:
-            self._mouse.apply(self._view.drag)
+        """Let mice pull at what they drag, in the control step that follows."""
+        drags = {} if self._view is None else dict(self._view.drags)
+        self._mice = {number: mouse for number, mouse in self._mice.items() if number in drags}
+        for number, drag in drags.items():
+            if number not in self._mice:
+                self._mice[number] = MouseForce(self._batch, self._env, self._push, self._number)
+            self._mice[number].apply(drag)
+
+    @property
+    def pull(self) -> float:
+        """Sum of the magnitudes of the impulses of all mice in the last control step [N s]."""
+        dt = self._batch.config.physics.control_dt
+        return dt * sum(float(np.linalg.norm(mouse.force)) for mouse in self._mice.values())
+
+    def scene(self) -> Scene:
+        """Describe the present scene, with an arrow for every mouse that drags."""
+        scene = self._scenes.scene(self._env, self.color)
+        arrows = [arrow for mouse in self._mice.values() if (arrow := mouse.arrow())]
+        return replace(scene, markers=[*scene.markers, *arrows]) if arrows else scene
 
     def step(self, speed: float = 1.0) -> None:
         """Show the scene after a control step, and wait for the rest of its time.
@@ -543,9 +575,7 @@ class Live:
     def show(self) -> None:
         """Show the present scene."""
         self._shown, self._behind = self.pace.clock(), False
-        scene, arrow = self._scenes.scene(self._env, self.color), self._mouse.arrow()
-        scene = replace(scene, markers=[*scene.markers, arrow]) if arrow else scene
-        self.view.show(scene, self._progress.since_last())
+        self.view.show(self.scene(), self._progress.since_last())
 
     def close(self) -> None:
         """Stop the server, if it was started; closing twice is fine."""

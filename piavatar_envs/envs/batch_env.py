@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,7 @@ from piavatar_envs.envs.state import (
 from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.checks import check_places
 from piavatar_envs.sim.forces import Target
+from piavatar_envs.sim.tuning import Tuning
 from piavatar_envs.sim.world import Simulation
 
 if TYPE_CHECKING:
@@ -278,9 +280,28 @@ class BatchEnv(EpisodeArrays):
         if self.simulation.forces:
             return
         self.simulation.enable_forces().record_reset(self.end_forces_graph, self.mask)
+        compile_graphs((self.end_forces_graph,))
+        self._record_step_anew()
+
+    def _record_step_anew(self) -> None:
+        """Replace the graph of the step, whose launches hold the numbers of the time when they were recorded."""
         self.step_graph = LaunchGraph(self.device)
         self._record_step(self.step_graph)
-        compile_graphs((self.step_graph, self.end_forces_graph))
+        compile_graphs((self.step_graph,))
+
+    @cached_property
+    def tuning(self) -> Tuning:
+        """Settings that may change while the world runs."""
+        return Tuning(self.simulation)
+
+    def tune(self, values: Mapping[str, float]) -> None:
+        """Change settings of the running world, by their names; see :class:`~piavatar_envs.sim.tuning.Tuning`.
+
+        Raises:
+            ValueError: a value is out of range or needs an environment of its own; nothing has changed then.
+        """
+        if self.tuning.set(values):
+            self._record_step_anew()
 
     def apply_force(self, target: Target, steps: int, at_point: bool) -> None:
         """Let the force in ``simulation.forces.call`` act for ``steps`` control steps, once forces are enabled.

@@ -67,8 +67,10 @@ def check_port(port: int) -> None:
         raise ValueError(f"port={port} is outside [1, {65536 - _TRIES}]")
 
 
-#: Keys held while the left button drags a body; without them the camera turns.
+#: Keys held while the left button drags a body, whatever the pointer does without them.
 DRAG_KEYS = "cmd/ctrl"
+#: Effects of the left button and of a finger, without keys, on a body or, for a throw, anywhere.
+POINTERS = ("camera", "drag", "throw")
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class LiveView:
     Attributes:
         server: the library's, for panels.
         url: address of the view.
-        drag: what a mouse drags now, or None; written by another thread.
+        drags: what mice drag now, by the number of their browser; written by another thread.
     """
 
     def __init__(self, camera: Camera | None = None, port: int = PORT) -> None:
@@ -110,7 +112,8 @@ class LiveView:
         library = import_viser()
         self._follower = Follower(camera or Camera())
         self._nodes: dict[str, viser.MeshHandle | viser.GaussianSplatHandle] = {}
-        self.drag: Drag | None = None
+        self.drags: dict[int, Drag] = {}
+        self._pointer = POINTERS[0]
         with _silence():
             self.server: viser.ViserServer = library.ViserServer(HOST, port, "piavatar-envs", verbose=False)
         # a page of any site could press the hidden button, so no public tunnel may be opened
@@ -119,13 +122,14 @@ class LiveView:
         self._stop = weakref.finalize(self, _stop, self.server)
         self.url = f"http://{HOST}:{self.server.get_port()}"
         self._set_up(self._follower.camera)
+        self.server.on_client_connect(_fit)
         print(f"live view: {self.url}", flush=True)
 
     def _set_up(self, camera: Camera) -> None:
         """Set up camera, light and ground as in the pictures."""
         scene, first = self.server.scene, self.server.initial_camera
         first.position, first.look_at, first.fov = camera.position, camera.target, math.radians(camera.field_of_view)
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="small")
         top, bottom = np.array(_STYLE.sky_top), np.array(_STYLE.sky_bottom)
         share = np.linspace(0.0, 1.0, 256)[:, None, None]
         sky = np.rint(255.0 * (top + share * (bottom - top))).astype(np.uint8)
@@ -198,20 +202,67 @@ class LiveView:
     def _add(self, name: str, node: viser.MeshHandle | viser.GaussianSplatHandle) -> None:
         """Keep a new node, which the mouse may drag if it is a body."""
         self._nodes[name] = node
+        self._bind(name, node)
+
+    def _bind(self, name: str, node: viser.MeshHandle | viser.GaussianSplatHandle) -> None:
+        """Let the mouse drag a body: with keys held, and without them if that is what the pointer does."""
         body = _BODY.match(name)
-        if body:
-            node.on_drag("left", modifier=DRAG_KEYS)(_follower(weakref.WeakMethod(self._follow), int(body[1])))
+        if body is None:
+            return
+        node.remove_drag_callback()
+        for keys in (DRAG_KEYS, None) if self._pointer == "drag" else (DRAG_KEYS,):
+            node.on_drag("left", modifier=keys)(_follower(weakref.WeakMethod(self._follow), int(body[1])))
+
+    @property
+    def pointer(self) -> str:
+        """Effect of the left button without keys, one of :data:`POINTERS`."""
+        return self._pointer
+
+    @pointer.setter
+    def pointer(self, pointer: str) -> None:
+        self._pointer = pointer
+        for name, node in self._nodes.items():
+            self._bind(name, node)
+
+    def on_throw(self, call: Callable[[int, np.ndarray, np.ndarray], None]) -> None:
+        """Register a function that clicks into the scene call while the pointer throws, in another thread.
+
+        Args:
+            call: with the number of the browser, and origin [m] and direction of the ray below the mouse, ``(3,)``.
+        """
+        view, throws = weakref.ref(self), weakref.WeakMethod(call)
+
+        async def click(event: viser.SceneClickEvent) -> None:
+            own, throw = view(), throws()
+            if own is not None and throw is not None and own.pointer == "throw":
+                throw(event.client_id, np.array(event.ray_origin) - own.offset, np.array(event.ray_direction))
+
+        self.server.scene.on_click()(click)
+
+    @property
+    def offset(self) -> np.ndarray:
+        """Way from the scene's origin to that of the browsers, whose cameras stay [m]."""
+        return np.array(self._world.position)
+
+    def camera_of(self, client: int | None) -> Camera:
+        """Return the camera of a browser, as pictures take it; the first one of a view without that browser."""
+        own = self.server.get_clients().get(client) if client is not None else None
+        camera = self._follower.camera
+        if own is None:
+            return camera
+        angle = min(max(math.degrees(own.camera.fov), 1.0), 120.0)
+        place, target = (tuple(np.array(at, float).tolist()) for at in (own.camera.position, own.camera.look_at))
+        return replace(camera, position=place, target=target, field_of_view=angle)
 
     async def _follow(self, body: int, event: viser.SceneNodeDragEvent) -> None:
-        """Keep what the mouse drags; a coroutine, because the library runs other functions in any order."""
-        world = np.array(self._world.position)
-        end = np.array(event.end_position) - world
+        """Keep what a mouse drags; a coroutine, because the library runs other functions in any order."""
+        end, mouse = np.array(event.end_position) - self.offset, event.client_id
         if event.phase == "end":
-            self.drag = None
+            self.drags.pop(mouse, None)
         elif event.phase == "start":
-            self.drag = Drag(body, np.array(event.start_position) - world, end)
-        elif self.drag is not None:
-            self.drag = replace(self.drag, end=end)
+            self.drags[mouse] = Drag(body, np.array(event.start_position) - self.offset, end)
+        elif mouse in self.drags:
+            self.drags[mouse] = replace(self.drags[mouse], end=end)
 
     @property
     def closed(self) -> bool:
@@ -221,6 +272,20 @@ class LiveView:
     def close(self) -> None:
         """Stop the server; closing twice is fine."""
         self._stop()
+
+
+async def _fit(client: viser.ClientHandle) -> None:
+    """Move the first camera of a window that is higher than wide back and up, above the panel at its foot."""
+    camera = client.camera
+    wide = camera.aspect
+    if wide >= 1.0:
+        return
+    eye, target = np.array(camera.position), np.array(camera.look_at)
+    away = 1.2 / max(wide, 0.3) * (eye - target)
+    # the lower half of the window shows the panel
+    target = target - [0.0, 0.0, 0.25 * float(np.linalg.norm(away)) * math.tan(camera.fov / 2.0) * 2.0]
+    with client.atomic():
+        camera.position, camera.look_at = target + away, target
 
 
 def _stop(server: viser.ViserServer) -> None:

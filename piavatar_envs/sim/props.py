@@ -216,24 +216,33 @@ class PropSet:
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
         """Record the launches that set density and motion of the masked environments' props."""
-        particles, n = self.model.particles, self.model.num_envs
-        for index, (prop, matter) in enumerate(zip(self.props, self.matter, strict=True)):
-            graph.launch(
-                scale_density,
-                (n, prop.count),
-                [mask, prop, self.density[:, index], matter, particles.volume],
-                [particles.mass, particles.mu, particles.lam],
-            )
-            column = self.fields_of[index]
-            graph.launch(copy_masked, n, [mask, self.density[:, index]], [self.model.contact.density[:, column]])
+        for index in range(len(self.props)):
+            self.record_density(graph, mask, index)
             self.record_place(graph, state, mask, index)
 
-    def record_place(self, graph: LaunchGraph, state: State, mask: wp.array, index: int) -> None:
-        """Record the launch that sets prop ``index`` of the masked environments in its initial motion, unstrained.
+    def record_density(self, graph: LaunchGraph, mask: wp.array, index: int) -> None:
+        """Record the launches that give prop ``index`` of the masked environments the mass of its density."""
+        prop, particles, n = self.props[index], self.model.particles, self.model.num_envs
+        density = self.density[:, index]
+        inputs = [mask, prop, density, self.matter[index], particles.volume]
+        graph.launch(scale_density, (n, prop.count), inputs, [particles.mass, particles.mu, particles.lam])
+        graph.launch(copy_masked, n, [mask, density], [self.model.contact.density[:, self.fields_of[index]]])
+
+    def record_place(
+        self, graph: LaunchGraph, state: State, mask: wp.array, index: int, start: PropState | None = None
+    ) -> None:
+        """Record the launch that sets prop ``index`` of the masked environments in motion, unstrained.
 
         Within an episode, before the physics of a step, this throws a prop or removes it from play.
+
+        Args:
+            graph: to append to.
+            state: of the particles.
+            mask: environments in which it is placed.
+            index: of the prop.
+            start: its motion; that after a reset if not given.
         """
-        prop, start = self.props[index], self.initial
+        prop, start = self.props[index], start or self.initial
         graph.launch(
             place_prop,
             (self.model.num_envs, prop.count),

@@ -93,16 +93,17 @@ def test_policies_play_as_in_training_in_figures_and_live(kind, run_of, device, 
     pytest.importorskip("viser", reason="needs the extra live")
     totals = []
 
-    def watch_env(env, act, seed, port, begin):
-        begin()
-        observation, _ = env.reset(seed=seed)
-        over, total = False, 0.0
+    def watch_setup(setup, kinds, port):
+        host = setup.make()
+        host.reset(setup.seed)
+        agent, over, total = kinds[setup.agent].make(host, setup.seed), False, 0.0
+        agent.begin(np.ones(1, bool))
         while not over:
-            observation, reward, terminated, truncated, _ = env.step(act(observation))
-            total, over = total + reward, terminated or truncated
-        totals.append((seed, port, total))
+            host.step(agent.act(0))
+            total, over = total + float(host.reward()[0, 0]), bool(host.find_ended()[0])
+        totals.append((setup.seed, port, total))
 
-    monkeypatch.setattr("piavatar_envs.watch.watch_env", watch_env)
+    monkeypatch.setattr("piavatar_envs.watch.watch_setup", watch_setup)
     play.main([str(folder), "--live", "--port", "8500", "--first-seed", "7", "--device", device])
     run = open_run(folder)
     task = load_task(run.env_id)

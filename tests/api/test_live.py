@@ -157,16 +157,16 @@ def test_the_mouse_pulls_at_what_it_drags(make_human, body):
     target = batch.simulation.receivers.find(name)
     start = target.frame.position.numpy()[0, target.column] + (np.array([0.05, 0.0, -0.05]) if body == 0 else 0.0)
     end, distances = start + np.array([0.1, 0.0, 0.1 if body == 0 else 0.5]), []
-    live.view.drag = Drag(body, start, end)
+    live.view.drags[0] = Drag(body, start, end)
     for _ in range(8):
         env.step(still)
-        distances.append(np.linalg.norm(live._mouse._grip.point(0) - end))
+        distances.append(np.linalg.norm(live._mice[0]._grip.point(0) - end))
     assert not batch.failure.numpy().any()
     slots = {key: value[0, 0] for key, value in env.unwrapped.get_state().items() if key.startswith("forces.")}
     assert slots["forces.target"] == target.index and slots["forces.remaining"] == 0
     assert distances[-1] < distances[0]
     assert any("arrow" in node for node in shown(env))
-    live.view.drag = None
+    live.view.drags.clear()
     env.step(still)
     assert not any("arrow" in node for node in shown(env))
 

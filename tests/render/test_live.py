@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import socket
 import sys
@@ -10,6 +11,7 @@ import urllib.request
 import weakref
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ import pytest
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.render import Arrow, Body, Camera, MovedSplats, Scene, Sphere
 from piavatar_envs.render.coloring import NUM_BANDS, bands_of, color_by
-from piavatar_envs.render.live import LiveView
+from piavatar_envs.render.live import LiveView, _fit
 from tests.avatar.splat_clouds import on_body
 
 GREEN = (0.0, 1.0, 0.0)
@@ -179,11 +181,13 @@ def test_a_body_that_blew_up_is_shown(view, body):
 class Mouse:
     """Events of a mouse that drags a node, as the library sends them."""
 
-    def __init__(self, node):
-        self.node = node
+    def __init__(self, node, number=0):
+        self.node, self.number = node, number
 
     def send(self, phase: str, start, end, modifier: str = "cmd/ctrl") -> None:
-        event = SimpleNamespace(phase=phase, start_position=tuple(start), end_position=tuple(end), target=self.node)
+        event = SimpleNamespace(
+            phase=phase, start_position=tuple(start), end_position=tuple(end), target=self.node, client_id=self.number
+        )
         for entry in self.node._impl.drag_cb:
             if entry.button == "left" and entry.modifier == modifier:
                 asyncio.run(entry.callback(event))
@@ -192,18 +196,62 @@ class Mouse:
 def test_a_mouse_drags_bodies_and_nothing_else(view, body):
     view.show(Scene([body], [Sphere((0, 0, 1), 0.1)], follow=np.array([2.0, 3.0, 0.9])), None)
     mouse, start, end = Mouse(handle(view, "body_0")), np.array([0.1, 0.2, 1.0]), np.array([0.5, 0.2, 1.2])
-    assert view.drag is None
+    assert not view.drags
     mouse.send("start", start, start)
     mouse.send("update", start + 0.1, end)
-    assert view.drag.body == 0
-    np.testing.assert_allclose(view.drag.start, start + [2.0, 3.0, 0.0])  # the world has moved below the camera
-    np.testing.assert_allclose(view.drag.end, end + [2.0, 3.0, 0.0])
+    assert view.drags[0].body == 0
+    np.testing.assert_allclose(view.drags[0].start, start + [2.0, 3.0, 0.0])  # the world has moved below the camera
+    np.testing.assert_allclose(view.drags[0].end, end + [2.0, 3.0, 0.0])
+    Mouse(handle(view, "body_0"), 5).send("start", start, end)  # of another browser
     mouse.send("end", start, end)
-    assert view.drag is None
+    assert list(view.drags) == [5]
+    view.drags.clear()
     mouse.send("start", start, end, modifier=None)  # this turns the camera
     Mouse(handle(view, "sphere_0")).send("start", start, end)
     mouse.send("update", start, end)
-    assert view.drag is None
+    assert not view.drags
+    view.pointer = "drag"
+    mouse.send("start", start, end, modifier=None)
+    assert list(view.drags) == [0]
+
+
+def test_clicks_throw_while_the_pointer_does(view, body):
+    view.show(Scene([body], [], follow=np.array([2.0, 3.0, 0.9])), None)
+
+    class Thrower:
+        thrown: ClassVar = []
+
+        def throw(self, client, origin, direction):
+            self.thrown.append((client, origin, direction))
+
+    thrower = Thrower()
+    view.on_throw(thrower.throw)
+    event = SimpleNamespace(client_id=4, ray_origin=(1.0, 2.0, 3.0), ray_direction=(0.0, 1.0, 0.0))
+    (entry,) = view.server.scene._scene_pointer_cb
+    asyncio.run(entry.callback(event))
+    assert not thrower.thrown
+    view.pointer = "throw"
+    asyncio.run(entry.callback(event))
+    ((client, origin, direction),) = thrower.thrown
+    assert client == 4
+    np.testing.assert_allclose(origin, (3.0, 5.0, 3.0))
+    np.testing.assert_allclose(direction, (0.0, 1.0, 0.0))
+
+
+def test_a_window_higher_than_wide_begins_farther_away():
+    class Client:
+        def __init__(self, aspect):
+            self.camera = SimpleNamespace(aspect=aspect, position=(0.0, -4.0, 1.0), look_at=(0.0, 0.0, 1.0), fov=0.5)
+
+        def atomic(self):
+            return contextlib.nullcontext()
+
+    wide, narrow = Client(1.5), Client(0.5)
+    for client in (wide, narrow):
+        asyncio.run(_fit(client))
+    assert wide.camera.position == (0.0, -4.0, 1.0)
+    np.testing.assert_allclose(narrow.camera.position - narrow.camera.look_at, (0.0, -9.6, 0.0), atol=1e-9)
+    assert narrow.camera.look_at[2] < 0.5
 
 
 def port_of(view: LiveView) -> int:
