@@ -1,13 +1,16 @@
 """Trainings on one batch, for any library: configuration, command line, evaluation.
 
 A batch advances all its environments in the same kernel launches and hands out tensors on their device. The learning
-itself is in ``agents/skrl/train.py`` and ``agents/rsl_rl/train.py``.
+itself is in ``agents/skrl/train.py`` and ``agents/rsl_rl/train.py``. Where torchrun has started several processes, each
+has a batch of its own, and their episodes are those of one batch that is as large as all of them.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,12 +19,13 @@ from typing import Annotated, Any, TypeVar
 import tyro
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
-from agents.checkpoint import Checkpoint, Diverged
+from agents.checkpoint import Checkpoint, Diverged, seed_all
 from agents.command import read_options, script_hint
 from agents.config import MOST_ENVS, MOST_RUNS, EvaluationSettings, first_training_seed, load_resolved
 from agents.evaluate import Agent, play_with_baselines
 from agents.files import made
 from agents.interrupt import command, ended_by_interrupt
+from agents.ranks import ALONE, Ranks, joined
 from agents.report import Curve, conclude, draw_curve, versions
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import (
@@ -50,7 +54,7 @@ class BatchTraining(BaseModel):
     observe: tuple[str, ...] | None = Field(
         None, description="terms of the observation that the networks see; null for all of it"
     )
-    num_envs: int = Field(64, ge=1, le=MOST_ENVS, description="environments of the batch")
+    num_envs: int = Field(64, ge=1, le=MOST_ENVS, description="environments of the batch, of each rank its own")
     iterations: int = Field(100, ge=1, description="rollouts, each followed by an update")
     seed: int = Field(0, ge=0, lt=MOST_RUNS, description="of the networks, the actions and the training episodes")
     checkpoint_every: int = Field(10, ge=1, description="iterations between two checkpoints")
@@ -62,6 +66,24 @@ class BatchTraining(BaseModel):
     def first_seed(self) -> int:
         """Return the seed of environment 0's episodes; environment ``i`` plays those of ``first_seed + i``."""
         return first_training_seed(self.seed)
+
+    def first_seed_on(self, ranks: Ranks) -> int:
+        """Return the seed of environment 0's episodes on a rank, whose batch follows that of the rank before.
+
+        Raises:
+            ConfigError: all ranks together have more environments than a training may have.
+        """
+        if (count := ranks.size * self.num_envs) > MOST_ENVS:
+            raise ConfigError(
+                f"num_envs={self.num_envs} on each of {ranks.size} ranks are {count} environments, and a training may "
+                f"have {MOST_ENVS}; use fewer"
+            )
+        return self.first_seed + ranks.rank * self.num_envs
+
+    def seed_draws(self, ranks: Ranks) -> None:
+        """Let ranks draw actions and minibatches of their own; call it once networks, the same on all, are built."""
+        if ranks.rank:
+            seed_all(self.seed + MOST_RUNS * ranks.rank)
 
 
 Training = TypeVar("Training", bound=BatchTraining)
@@ -152,32 +174,67 @@ def run(
         name: of the script.
         cls: its configuration.
         find_task: the task of an environment's id.
-        learn: trains; given the configuration, the task, the folder to write to, the device, and the checkpoint from
-            which to go on and which to keep up. It leaves the configuration in the folder when it refuses no more.
+        learn: trains on all ranks; given the configuration, the task, the folder to write to, the device of the rank,
+            and the checkpoint from which to go on and which to keep up. Rank 0 leaves the configuration in the folder
+            when it refuses no more.
         args: command line, by default the process's own.
     """
-    options = read_options(Options, name, args)
+    options, ranks = read_options(Options, name, args), Ranks.here()
     quiet_warp()
     try:
-        config = load_batched(cls, find_task, options.config, parse_assignments(options.settings))
-        check_device(options.device)
-    except ValueError as error:
-        sys.exit(f"error: {error}{script_hint(options.config, name)}")
-    folder = options.out or Path("runs") / options.config.stem
-    try:
-        task = new_task(config, find_task)
-        with made(folder):
-            checkpoint = Checkpoint(folder, name, config, options.device, options.resume)
-            iterations_of(checkpoint, config.iterations)
-            with ended_by_interrupt(partial(checkpoint.remedy, command(name, args, "--resume"))):
-                learned = learn(config, task, folder, options.device, checkpoint)
-                evaluate_batch(name, config, find_task, learned, folder, options.device)
+        with joined(ranks, options.device) as device:
+            _run(name, cls, find_task, learn, args, options, ranks, device)
     except (ConfigError, Diverged, OSError) as error:
         sys.exit(f"error: {error}")
 
 
+def _run(
+    name: str,
+    cls: type[Training],
+    find_task: FindTask,
+    learn: Callable[[Training, Task, Path, str, Checkpoint], Learned],
+    args: list[str] | None,
+    options: Options,
+    ranks: Ranks,
+    device: str,
+) -> None:
+    """Train and evaluate on a rank.
+
+    Raises:
+        ConfigError: a setting, an option, or what the folder holds.
+        Diverged: the networks are not finite any more.
+        OSError: a file cannot be written.
+    """
+    try:
+        config = load_batched(cls, find_task, options.config, parse_assignments(options.settings))
+        check_device(device)
+    except ValueError as error:
+        raise ConfigError(f"{error}{script_hint(options.config, name)}") from None
+    if int(restarts := os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0")) and not options.resume:
+        raise ConfigError(
+            f"torchrun --max-restarts={restarts} starts what has failed with the same command; add --resume, with "
+            "which it goes on from the checkpoint"
+        )
+    folder = options.out or Path("runs") / options.config.stem
+    task = new_task(config, find_task)
+    with made(folder) if ranks.first else nullcontext():
+        checkpoint = Checkpoint(folder, name, config, options.device, options.resume, ranks)
+        iterations_of(checkpoint, config.iterations)
+        again = command(name, args, "--resume", ranks=ranks)
+        with ended_by_interrupt(partial(checkpoint.remedy, again), silent=not ranks.first):
+            learned = learn(config, task, folder, device, checkpoint)
+            if ranks.first:
+                evaluate_batch(name, config, find_task, learned, folder, device, ranks)
+
+
 def evaluate_batch(
-    name: str, config: BatchTraining, find_task: FindTask, learned: Learned, folder: Path, device: str
+    name: str,
+    config: BatchTraining,
+    find_task: FindTask,
+    learned: Learned,
+    folder: Path,
+    device: str,
+    ranks: Ranks = ALONE,
 ) -> None:
     """Evaluate a trained agent and write ``results.json`` and the curve. Arguments are as for :func:`run`."""
     task = new_task(config, find_task)
@@ -189,7 +246,7 @@ def evaluate_batch(
     draw_curve(folder / "curve.png", learned.curve.steps, learned.curve.returns, bands, config.env_id)
     about = versions(name, device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
     cost = {"training_s": learned.curve.seconds, "train_steps": learned.curve.train_steps}
-    extra = {**cost, "num_envs": config.num_envs, "agents": task.agent_names}
+    extra = {**cost, "num_envs": config.num_envs, "ranks": ranks.size, "agents": task.agent_names}
     conclude(folder, about, results, extra, "policy.pt, curve.png, curve.csv, config.yaml, results.json")
 
 

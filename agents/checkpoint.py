@@ -6,6 +6,8 @@ on: networks, optimizers, random numbers, environments (0.4 MB each at ``fidelit
 the learner saw last, and the curve so far. It is read without running code that it might carry
 (``torch.load(weights_only=True)``).
 
+A training of several ranks has one file, too: rank 0 writes and reads it, and exchanges the states with the others.
+
 A training whose parameters or outputs are no longer finite ends in an error before it writes anything.
 """
 
@@ -24,6 +26,7 @@ from pydantic import BaseModel
 
 from agents.files import CHECKPOINT, POLICIES, RESULTS, git_commit, hold, write_atomically
 from agents.interrupt import StopRequest
+from agents.ranks import ALONE, Ranks
 from piavatar_envs.config import ConfigError
 from piavatar_envs.core.reading import UNREADABLE, first_line
 from piavatar_envs.doctor import package_version
@@ -49,17 +52,21 @@ class Checkpoint:
         state: what it held when the run began, or None for a run from the start.
         reached: how long the training was that the file holds; empty without a file.
         stop: by which the training ends once it is written.
+        ranks: of the training.
     """
 
-    def __init__(self, folder: Path, script: str, config: BaseModel, device: str, resume: bool) -> None:
+    def __init__(
+        self, folder: Path, script: str, config: BaseModel, device: str, resume: bool, ranks: Ranks = ALONE
+    ) -> None:
         """Read the checkpoint of a folder, or prepare for a new training.
 
         Args:
-            folder: of the run; exists.
+            folder: of the run; exists where rank 0 is.
             script: that trains.
             config: resolved.
-            device: where it simulates and learns.
+            device: where it simulates and learns, as it was asked for.
             resume: whether to go on from what the folder holds; where it holds nothing, the run begins.
+            ranks: all of which build one.
 
         Raises:
             ConfigError: a checkpoint of another configuration, device or version, or one that cannot be read; or
@@ -67,9 +74,7 @@ class Checkpoint:
                 was kept without its checkpoint.
         """
         self.path = folder / CHECKPOINT
-        hold(folder)
-        self.state: dict[str, Any] | None = None
-        self.reached, self.stop = "", StopRequest()
+        self.reached, self.stop, self.ranks = "", StopRequest(ranks), ranks
         commit, _ = git_commit()
         self._about = {
             "script": script,
@@ -77,25 +82,42 @@ class Checkpoint:
             "config": config.model_dump(mode="json"),
             "versions": {name: package_version(name) for name in PACKAGES},
             "commit": commit,
+            "ranks": ranks.size,
         }
+        self.state: dict[str, Any] | None = ranks.scatter(self._open(folder, resume) if ranks.first else [])
+        if self.state is not None:
+            self.reached = self._length(self.state)
+
+    def _open(self, folder: Path, resume: bool) -> list[dict[str, Any] | None]:
+        """Lock the folder, and return the state that each rank resumes from."""
+        hold(folder)
         if not self.path.exists():
             for name in (*POLICIES, RESULTS):
                 if (folder / name).exists():
                     raise ConfigError(f"{folder / name} is of a training that has ended; write elsewhere with --out")
-            return
+            return [None] * self.ranks.size
         if not resume:
             raise ConfigError(
                 f"{folder} holds a training already; go on with --resume, write to another folder with --out, or "
                 f"delete {self.path} to lose it"
             )
-        self.state = self._read()
-        self.reached = self._length(self.state)
+        content = read_checkpoint(self.path)
+        self._compare(content["about"])
+        return [content["state"], *(content["state"] | own for own in content.get("others", ()))]
 
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Replace the saved state by a new one: nested containers of tensors, arrays and plain values."""
-        content = {"format": FORMAT, "about": self._about, "state": as_tensors(state)}
-        write_atomically(self.path, lambda file: torch.save(content, file))
-        self.reached = self._length(state)
+    def save(self, shared: Mapping[str, Any], own: Mapping[str, Any] | None = None) -> None:
+        """Replace the saved state by a new one: nested containers of tensors, arrays and plain values.
+
+        Args:
+            shared: the same on all ranks, which all save.
+            own: this rank's, resumed from as if they were one.
+        """
+        parts = self.ranks.gather(as_tensors(own or {}))
+        self.reached = self._length(shared)
+        if self.ranks.first:
+            state = as_tensors(shared) | parts[0]
+            content = {"format": FORMAT, "about": self._about, "state": state, "others": parts[1:]}
+            write_atomically(self.path, lambda file: torch.save(content, file))
 
     def remedy(self, command: str) -> str:
         """Return what an interrupted training has reached, and how to go on.
@@ -114,11 +136,6 @@ class Checkpoint:
                 return f"{state[unit]} of {self._about['config'][length]} {unit}"
         return ""
 
-    def _read(self) -> dict[str, Any]:
-        content = read_checkpoint(self.path)
-        self._compare(content["about"])
-        return content["state"]
-
     def _compare(self, was: dict[str, Any]) -> None:
         """Refuse a checkpoint that another version, configuration, script or device wrote."""
         for section, remedy in (
@@ -134,6 +151,11 @@ class Checkpoint:
                 raise ConfigError(
                     f"{self.path} was written with {name} {was[name]!r}, now it is {self._about[name]!r}; use the same"
                 )
+        if (before := was.get("ranks", 1)) != self.ranks.size:
+            raise ConfigError(
+                f"{self.path} was written by {before} ranks, now there are {self.ranks.size}; start as many with "
+                "torchrun, or begin anew in another folder with --out"
+            )
         if was["commit"] != self._about["commit"]:
             warnings.warn(
                 f"{self.path} was written by commit {was['commit']}, this is {self._about['commit']}: the curve may "
@@ -205,7 +227,7 @@ def settings_changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[
 
 
 def as_tensors(value: Any) -> Any:
-    """Replace NumPy arrays in nested plain containers by tensors, and NumPy scalars by Python numbers."""
+    """Replace arrays in nested plain containers by tensors on the host, and NumPy scalars by Python numbers."""
     if isinstance(value, Mapping):
         return {name: as_tensors(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -213,6 +235,8 @@ def as_tensors(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         # thousands of environments are gigabytes: not copied without need
         return torch.from_numpy(np.require(value, requirements=["C_CONTIGUOUS", "WRITEABLE"]))
+    if isinstance(value, torch.Tensor):
+        return value.cpu()
     return value.item() if isinstance(value, np.generic) else value
 
 

@@ -9,7 +9,10 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from agents.ranks import Ranks  # which needs torch
 
 _NOTICE = b"\nending where the training can go on later, after this rollout; Ctrl-C again ends it at once\n"
 
@@ -18,12 +21,21 @@ class StopRequest:
     """Request to end a training, made by Ctrl-C while :meth:`listening`.
 
     Attributes:
-        made: whether there was one.
+        made: whether there was one in this process.
         reached: what the training had had when it ended.
     """
 
-    def __init__(self) -> None:
-        self.made, self.reached = False, ""
+    def __init__(self, ranks: Ranks | None = None) -> None:
+        """Begin without a request.
+
+        Args:
+            ranks: processes that end together; None for one alone.
+        """
+        self.made, self.reached, self._ranks = False, "", ranks
+
+    def asked(self) -> bool:
+        """Return whether any rank has had a request; to be called on all of them."""
+        return self.made if self._ranks is None else self._ranks.any(self.made)
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -39,7 +51,8 @@ class StopRequest:
             if self.made:
                 signal.default_int_handler(number, frame)
             self.made = True
-            os.write(2, _NOTICE)  # a signal may interrupt a print, which cannot be entered again
+            if self._ranks is None or self._ranks.first:
+                os.write(2, _NOTICE)  # a signal may interrupt a print, which cannot be entered again
 
         before = signal.signal(signal.SIGINT, request)
         try:
@@ -48,7 +61,7 @@ class StopRequest:
             signal.signal(signal.SIGINT, before)
 
     def obey(self, reached: str) -> None:
-        """End the training if there was a request; call it where nothing is lost.
+        """End the training if there was a request; call it where nothing is lost, and on all ranks.
 
         Args:
             reached: what the training has had.
@@ -56,17 +69,18 @@ class StopRequest:
         Raises:
             KeyboardInterrupt: there was one.
         """
-        if self.made:
+        if self.asked():
             self.reached = reached
             raise KeyboardInterrupt
 
 
 @contextmanager
-def ended_by_interrupt(remedy: Callable[[], str]) -> Iterator[None]:
+def ended_by_interrupt(remedy: Callable[[], str], silent: bool = False) -> Iterator[None]:
     """End the script by Ctrl-C with one line and exit status 130, instead of a traceback.
 
     Args:
         remedy: returns the rest of the line: what was reached, and how to go on.
+        silent: leave the line to another rank.
 
     Raises:
         SystemExit: Ctrl-C.
@@ -74,17 +88,24 @@ def ended_by_interrupt(remedy: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        print(f"\ninterrupted {remedy()}", file=sys.stderr)  # a bar may have the line before
+        if not silent:
+            print(f"\ninterrupted {remedy()}", file=sys.stderr)  # a bar may have the line before
         raise SystemExit(128 + signal.SIGINT) from None
 
 
-def command(script: str, args: Sequence[str] | None, *more: str) -> str:
+def command(script: str, args: Sequence[str] | None, *more: str, ranks: Ranks | None = None) -> str:
     """Return the command line of a script as it was given, with options that it lacks.
 
     Args:
         script: its name, without ``agents.``.
         args: as given to its ``main``: None for the process's own.
         *more: options to add.
+        ranks: processes that torchrun has started; of several machines, each has the same command.
     """
     given = list(sys.argv[1:] if args is None else args)
-    return shlex.join(["python", "-m", f"agents.{script}", *given, *(option for option in more if option not in given)])
+    given += [option for option in more if option not in given]
+    launcher = ["python"]
+    if ranks is not None and ranks.size > 1:
+        machines = ranks.size // ranks.local_size
+        launcher = ["torchrun", f"--nnodes={machines}", f"--nproc-per-node={ranks.local_size}"]
+    return shlex.join([*launcher, "-m", f"agents.{script}", *given])

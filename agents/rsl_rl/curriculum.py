@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field, model_validator
 from tensordict import TensorDict
 
 from agents.config import changed
+from agents.ranks import ALONE, Ranks
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
 from piavatar_envs.config import FROZEN, ConfigError, EnvConfig, load_config
 from piavatar_envs.envs.task import Task
@@ -88,10 +89,11 @@ class Curriculum(Protocol):
 class Assist:
     """Root assist that declines.
 
-    Environment ``i`` of ``n`` begins with ``i / (n - 1)`` of the greatest assist, so that some train almost without it
-    from the start; a single one has all of it. By time it keeps that share of a greatest assist that falls. By success,
-    every environment settles where half of its episodes succeed, and loses its assist where more do, as the pulling
-    force of Huang et al., "Learning Humanoid Standing-up Control across Diverse Postures" (2025), which never rises.
+    Environment ``i`` of the ``n`` of all ranks begins with ``i / (n - 1)`` of the greatest assist, so that some train
+    almost without it from the start; a single one has all of it. By time it keeps that share of a greatest assist that
+    falls. By success, every environment settles where half of its episodes succeed, and loses its assist where more do,
+    as the pulling force of Huang et al., "Learning Humanoid Standing-up Control across Diverse Postures" (2025), which
+    never rises.
 
     Attributes:
         assist: of every environment, ``(num_envs,)`` float32 on the device.
@@ -99,8 +101,9 @@ class Assist:
 
     def __init__(self, settings: AssistSchedule, env: AvatarRslEnv) -> None:
         """Begin with the first assist."""
-        self.settings, n = settings, env.num_envs
-        self._spread = torch.linspace(0.0, 1.0, n, device=env.device) if n > 1 else torch.ones(1, device=env.device)
+        self.settings, n = settings, env.ranks.size * env.num_envs
+        spread = torch.linspace(0.0, 1.0, n, device=env.device) if n > 1 else torch.ones(1, device=env.device)
+        self._spread = spread[env.ranks.rank * env.num_envs :][: env.num_envs]
         self.assist = settings.first * self._spread
 
     def begin(self, env: CurriculumEnv) -> None:
@@ -133,7 +136,7 @@ class MotionWeights:
     An episode fails if it ends before its time. Where ``k`` episodes of a motion ended in a rollout, a share ``s`` of
     them failures, its smoothed share becomes ``s + (failed - s) (1 - 1 / memory)^k``. It begins at 1, so that motions
     that have not been tried yet are drawn as often as the worst. The weight is the smoothed share, at least ``floor``.
-    Weights change between rollouts only, and no environment depends on another within one.
+    Weights change between rollouts only, for all ranks alike, and no environment depends on another within one.
 
     Attributes:
         failed: smoothed share of failures of every motion, ``(motions,)`` float32 on the device.
@@ -165,7 +168,7 @@ class MotionWeights:
         failed = ended & ~extras["time_outs"]
         self._episodes.index_add_(1, self._playing, torch.stack([ended, failed]).float())
         if env.steps % env.rollout_steps == 0:
-            episodes, failures = self._episodes
+            episodes, failures = env.ranks.add(self._episodes)
             share = failures / episodes.clamp(min=1.0)
             self.failed = share + (self.failed - share) * (1.0 - 1.0 / self.settings.memory) ** episodes
             self._episodes = torch.zeros_like(self._episodes)
@@ -202,34 +205,44 @@ class CurriculumEnv(AvatarRslEnv):
     Attributes:
         steps: control steps of every environment so far; to be set when a training resumes.
         rollout_steps: of them in a rollout.
+        ranks: of the training; each has such environments.
         curricula: by name, see :data:`CURRICULA`.
     """
 
-    def __init__(self, schedules: Mapping[str, Any], rollout_steps: int, *args: Any, **kwargs: Any) -> None:
+    def __init__(
+        self, schedules: Mapping[str, Any], rollout_steps: int, *args: Any, ranks: Ranks = ALONE, **kwargs: Any
+    ) -> None:
         """Build the environments.
 
         Args:
             schedules: settings of the curricula, by name.
             rollout_steps: control steps of a rollout.
             *args: those of the base.
-            **kwargs: likewise.
+            ranks: of the training.
+            **kwargs: those of the base.
 
         Raises:
             ConfigError: also for a curriculum that does not fit the environment.
         """
         super().__init__(*args, **kwargs)
-        self.rollout_steps, self.steps = rollout_steps, 0
+        self.rollout_steps, self.steps, self.ranks = rollout_steps, 0, ranks
         self.curricula: dict[str, Curriculum] = {
             name: CURRICULA[name](settings, self) for name, settings in schedules.items()
         }
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance by one control step; ``extras["log"]`` also holds figures of the curricula."""
+        """Advance by one control step; ``extras["log"]`` also holds figures of the curricula, and of ended episodes.
+
+        ``Episodes/ended`` and ``Episodes/succeeded`` are shares of the environments whose episode has ended in this
+        step, and has ended in success.
+        """
         for curriculum in self.curricula.values():
             curriculum.begin(self)
         stepped = super().step(actions)
         self.steps += 1
         _, _, ended, extras = stepped
+        extras["log"]["Episodes/ended"] = ended.float().mean()
+        extras["log"]["Episodes/succeeded"] = (ended.bool() & extras["info"]["success"].bool()).float().mean()
         for curriculum in self.curricula.values():
             curriculum.end(self, ended.bool(), extras)
         return stepped

@@ -30,9 +30,11 @@ class ScaledPPO(PPO):
     Attributes:
         updates: how many there have been; to be set where a training goes on.
         check: is called after each, also after one that torch has refused to end; to be set.
+        learned: is called after each that has ended, by all ranks; to be set.
     """
 
     check: Callable[[], None]
+    learned: Callable[[], None]
 
     def __init__(
         self, *args: Any, reward_scale: float, observation_noise: float, kl_targets: Sequence[float], **settings: Any
@@ -65,6 +67,7 @@ class ScaledPPO(PPO):
             self.check()
             raise
         self.check()
+        self.learned()
         return losses
 
     def process_env_step(

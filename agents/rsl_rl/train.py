@@ -2,12 +2,14 @@
 
 Writes to the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's own saved networks, the
 learning curve, and the evaluation. A killed training continues with ``--resume`` from the latest checkpoint, with the
-same results as without the interruption.
+same results as without the interruption. ``torchrun --nproc-per-node=2 -m agents.rsl_rl.train ...`` trains on two GPUs.
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,14 @@ import numpy as np
 import torch
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.log_writer import LogWriter
+from rsl_rl.utils.logger import Logger
 from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
 from agents.batch_training import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, seed_all, set_random_states
 from agents.files import write_atomically, write_config
+from agents.ranks import ALONE, Ranks
 from agents.report import Curve
 from agents.rsl_rl.curriculum import CURRICULA, CurriculumEnv, training_settings
 from agents.rsl_rl.policy import RslTraining, actor_settings, mean_agent, network_settings
@@ -61,6 +65,59 @@ class CurveWriter(LogWriter):
         self._events.close()
 
 
+class SilentWriter(LogWriter):
+    """Writer of the ranks whose figures rank 0 writes."""
+
+    def add_scalar(self, tag: str, scalar_value: Any, global_step: int) -> None:
+        """Write nothing."""
+
+
+class RanksLogger(Logger):
+    """rsl_rl's logger, with figures of all ranks: each books its episodes, and rank 0 writes means over them."""
+
+    def __init__(self, ranks: Ranks, *args: Any, **settings: Any) -> None:
+        """Build the logger.
+
+        Args:
+            ranks: of the training.
+            *args: those of the base.
+            **settings: likewise.
+        """
+        super().__init__(*args, **settings)
+        self.ranks = ranks
+        self.git_status_repos.clear()  # results.json has the commit; no diffs of other repositories
+
+    def init_logging_writer(self) -> None:
+        """Open the files on rank 0."""
+        if self.ranks.first:
+            super().init_logging_writer()
+        else:
+            self.writer = SilentWriter()
+
+    def log(self, *args: Any, **figures: Any) -> None:
+        """Log an iteration on rank 0."""
+        if self.ranks.size > 1:
+            own = self.rewbuffer, self.lenbuffer
+            parts = self.ranks.gather([list(self.rewbuffer), list(self.lenbuffer), self._means()])
+            self.ep_extras = [means for _, _, means in parts]
+            self.rewbuffer, self.lenbuffer = (deque(chain(*(part[index] for part in parts))) for index in (0, 1))
+        if self.ranks.first:
+            super().log(*args, **figures)
+        if self.ranks.size > 1:
+            self.rewbuffer, self.lenbuffer = own
+
+    def _means(self) -> dict[str, float]:
+        """Return the means over an iteration of what the environments have logged."""
+        names = dict.fromkeys(name for logged in self.ep_extras for name in logged)
+        return {
+            name: torch.cat([torch.as_tensor(logged[name]).flatten() for logged in self.ep_extras if name in logged])
+            .float()
+            .mean()
+            .item()
+            for name in names
+        }
+
+
 class Runner(OnPolicyRunner):
     """rsl_rl's runner, which also saves a checkpoint and resumes from one.
 
@@ -76,19 +133,41 @@ class Runner(OnPolicyRunner):
         if saved:
             self.curve.load(saved["curve"])
         self._begun = time.monotonic() - self.curve.seconds
+        self._ranks = checkpoint.ranks
+        self._steps_an_iteration = self._ranks.size * config.num_envs * config.ppo.rollout_steps
         settings = runner_settings(config, env) | {
             "logger": {
                 "class_name": CurveWriter,
-                "steps_an_iteration": config.num_envs * config.ppo.rollout_steps,
+                "steps_an_iteration": self._steps_an_iteration,
                 "first_iteration": self.iterations,
                 "curve": self.curve,
             }
         }
         super().__init__(env, settings, log_dir=str(folder / "rsl_rl"), device=str(env.device))
-        self.alg.check, self._config, self._folder = self._check_update, config, folder
-        self.logger.git_status_repos.clear()  # results.json has the commit; no diffs of other repositories
+        self.alg.check, self.alg.learned = self._check_finite, self._end_if_asked
+        self._config, self._folder = config, folder
+        self.logger = RanksLogger(
+            self._ranks,
+            self.logger.log_dir,
+            self.cfg,
+            env.cfg,
+            env.num_envs,
+            self.is_distributed,
+            self.gpu_world_size,
+            self.gpu_global_rank,
+            self.device,
+        )
+        config.seed_draws(self._ranks)
         if saved:
             self._restore(saved)
+
+    def _configure_multi_gpu(self) -> None:
+        """Take over the group that has been joined, in which ranks may also be CPUs; rsl_rl would start another."""
+        ranks = self._ranks
+        self.gpu_global_rank, self.gpu_local_rank, self.gpu_world_size = ranks.rank, ranks.local_rank, ranks.size
+        self.is_distributed = ranks.size > 1
+        group = {"global_rank": ranks.rank, "local_rank": ranks.local_rank, "world_size": ranks.size}
+        self.cfg["multi_gpu"] = group if self.is_distributed else None
 
     def train(self, iterations: int) -> None:
         """Learn until the training has had ``iterations``.
@@ -104,25 +183,22 @@ class Runner(OnPolicyRunner):
                 self.learn(left, init_at_random_ep_len=self.iterations == 0)
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Save the networks and the checkpoint; rsl_rl calls it between iterations."""
-        super().save(path, infos)
-        self.iterations, self.curve = self.current_learning_iteration + 1, self.logger.writer.curve
+        """Save the networks and the checkpoint; rsl_rl calls it between iterations, on all ranks."""
+        self.iterations = self.current_learning_iteration + 1
+        if self._ranks.first:
+            super().save(path, infos)
+            self.curve = self.logger.writer.curve
+            if "motions" in self.env.curricula:
+                table = self.env.curricula["motions"].table(self.env.host.task.motion_names)
+                write_atomically(self._folder / "motions.csv", lambda file: file.write(table.encode()))
         self.curve.seconds = time.monotonic() - self._begun
-        if "motions" in self.env.curricula:
-            table = self.env.curricula["motions"].table(self.env.host.task.motion_names)
-            write_atomically(self._folder / "motions.csv", lambda file: file.write(table.encode()))
-        self.checkpoint.save(self._state())
+        self.checkpoint.save(self._shared_state(), self._own_state())
         self.checkpoint.stop.obey(self.checkpoint.reached)
 
-    def _check_update(self) -> None:
-        """Let an iteration that Ctrl-C has made the last one be saved, if the networks are finite.
-
-        Raises:
-            Diverged: they are not.
-        """
-        if self.checkpoint.stop.made:
+    def _end_if_asked(self) -> None:
+        """Let an iteration that Ctrl-C has made the last one be saved."""
+        if self.checkpoint.stop.asked():
             self.cfg["save_interval"] = 1
-        self._check_finite()
 
     def _check_finite(self) -> None:
         """Raise an error if networks have diverged, before anything is saved.
@@ -134,21 +210,26 @@ class Runner(OnPolicyRunner):
         seen = self.env.get_observations()
         with torch.no_grad():
             outputs = {f"the {name}'s output": network(seen) for name, network in networks.items()}
-        steps = self.alg.updates * config.num_envs * config.ppo.rollout_steps
+        steps = self.alg.updates * self._steps_an_iteration
         check_finite(networks, outputs, steps, ("ppo.learning_rate", config.ppo.learning_rate), self.checkpoint.path)
 
-    def _state(self) -> dict[str, Any]:
-        log = self.logger
-        adapted = {name: curriculum.state() for name, curriculum in self.env.curricula.items()}
+    def _shared_state(self) -> dict[str, Any]:
+        """Return what is the same on all ranks, or rank 0's to write."""
         return {
-            "curricula": adapted,
             "iterations": self.iterations,
             "algorithm": self.alg.save(),
+            "logged": [self.logger.tot_timesteps, self.logger.tot_time],
+            "curve": self.curve.state(),
+        }
+
+    def _own_state(self) -> dict[str, Any]:
+        """Return what every rank has of its own."""
+        log = self.logger
+        return {
+            "curricula": {name: curriculum.state() for name, curriculum in self.env.curricula.items()},
             "envs": self.env.host.get_state(),
             "returns": [list(log.rewbuffer), list(log.lenbuffer)],
             "playing": [log.cur_reward_sum, log.cur_episode_length],
-            "logged": [log.tot_timesteps, log.tot_time],
-            "curve": self.curve.state(),
             "random": random_states(),
         }
 
@@ -234,8 +315,8 @@ def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
     return {"data_augmentation_func": append, "use_data_augmentation": True}
 
 
-def make_env(config: RslTraining, task: Task, device: str) -> CurriculumEnv:
-    """Build the training environments.
+def make_env(config: RslTraining, task: Task, device: str, ranks: Ranks = ALONE) -> CurriculumEnv:
+    """Build the training environments of a rank.
 
     Raises:
         ConfigError: there is no such term to observe, an assist under pose control, or a curriculum that does not fit.
@@ -248,19 +329,19 @@ def make_env(config: RslTraining, task: Task, device: str) -> CurriculumEnv:
             f"assist declines to 0, and env.control.root_assist={settings.control.root_assist} stays; give one of them"
         )
     groups = None if config.observe is None else {"policy": config.observe}
-    about = (config.env_id, config.num_envs, device, settings, groups, config.first_seed)
+    about = (config.env_id, config.num_envs, device, settings, groups, config.first_seed_on(ranks), ranks.threads)
     given = {name: getattr(config, name) for name in CURRICULA}
     schedules = {name: settings for name, settings in given.items() if settings is not None}
-    return CurriculumEnv(schedules, config.ppo.rollout_steps, *about)
+    return CurriculumEnv(schedules, config.ppo.rollout_steps, *about, ranks=ranks)
 
 
 def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
-    """Train an agent.
+    """Train an agent; to be called on all ranks.
 
     Args:
         config: resolved.
         task: of the environments.
-        folder: where to write; exists.
+        folder: where rank 0 writes; exists.
         device: where to simulate and to learn.
         checkpoint: from which to go on, and which to keep up.
 
@@ -268,14 +349,17 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
         ConfigError: the configuration does not fit the environment, or the checkpoint has had more iterations.
         Diverged: the networks are not finite any more.
     """
-    env = make_env(config, task, device)
+    ranks = checkpoint.ranks
+    env = make_env(config, task, device, ranks)
     seed_all(config.seed)
     runner = Runner(env, config, folder, checkpoint)
-    write_config(folder, config)
+    if ranks.first:
+        write_config(folder, config)
     runner.train(config.iterations)
-    runner.curve.train_steps = config.iterations * config.num_envs * config.ppo.rollout_steps
+    runner.curve.train_steps = ranks.size * config.iterations * config.num_envs * config.ppo.rollout_steps
     actor = runner.get_inference_policy(str(env.device))
-    write_atomically(folder / "policy.pt", lambda file: torch.save(actor.state_dict(), file))
+    if ranks.first:
+        write_atomically(folder / "policy.pt", lambda file: torch.save(actor.state_dict(), file))
     env.close()
     return Learned(mean_agent(actor, components(env.observation_layout, config.observe), str(env.device)), runner.curve)
 

@@ -13,6 +13,7 @@ from skrl.memories.torch import RandomMemory
 from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 
 from agents.config import Widths
+from agents.ranks import ALONE, Ranks
 from piavatar_envs.config import FROZEN
 
 
@@ -79,8 +80,9 @@ class Critic(DeterministicMixin, Model):
 class ActedMemory(RandomMemory):
     """Memory that samples only the steps that the agent took itself, not those after it left."""
 
-    def __init__(self, memory_size: int, num_envs: int, device: Any) -> None:
+    def __init__(self, memory_size: int, num_envs: int, device: Any, ranks: Ranks = ALONE) -> None:
         super().__init__(memory_size=memory_size, num_envs=num_envs, device=device)
+        self.ranks = ranks
         self.acted = torch.ones(memory_size, num_envs, dtype=torch.bool, device=self.device)
 
     def set_tensor_by_name(self, name: str, tensor: torch.Tensor) -> None:
@@ -93,7 +95,8 @@ class ActedMemory(RandomMemory):
     def sample(
         self, names: list[str], *, batch_size: int, mini_batches: int = 1, sequence_length: int = 1
     ) -> list[list[torch.Tensor]]:
-        """Sample minibatches in random order; none if the agent was out all the time."""
+        """Sample minibatches in random order, as many on all ranks; none if the agent was out all the time on one."""
         rows = self.acted.flatten().nonzero().flatten().cpu()
         rows = rows[torch.randperm(len(rows))]
-        return self.sample_by_index(names, indexes=rows, mini_batches=min(mini_batches, len(rows))) if len(rows) else []
+        count = self.ranks.least(min(mini_batches, len(rows)))
+        return self.sample_by_index(names, indexes=rows, mini_batches=count) if count else []

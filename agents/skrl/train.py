@@ -4,12 +4,15 @@ MAPPO (Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agen
 policy of what it sees itself and a critic of what all of them see. Leaves in the folder: the resolved configuration,
 the networks, TensorBoard's files with networks on the way there, every training episode's return, and the evaluation.
 What was killed goes on with ``--resume``, from the latest checkpoint and as if nothing had happened.
+``torchrun --nproc-per-node=2 -m agents.skrl.train ...`` trains on two GPUs.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states
 from agents.config import multi_game
 from agents.evaluate import Agent
 from agents.files import write_atomically, write_config
+from agents.ranks import ALONE, Ranks
 from agents.report import Curve
 from agents.sb3.workers import components
 from agents.skrl.networks import ActedMemory, Critic, MAPPOSettings, Policy
@@ -91,7 +95,9 @@ class WorldMAPPO(MAPPO):
         """
         super().__init__(**arguments)
         self.env, self.checkpoint, self.checkpoint_every = env, checkpoint, checkpoint_every
+        self.ranks = checkpoint.ranks if checkpoint else ALONE
         self.curve, self.iterations = Curve(), 0
+        self._merged = 0  # episodes of the curve that are of all ranks
         self._first_step, self._steps, self._totals = 0, 0, torch.zeros(env.num_envs, device=self.device)
         self._begun = time.monotonic()
 
@@ -108,12 +114,21 @@ class WorldMAPPO(MAPPO):
 
     def _book(self, rewards: dict[str, torch.Tensor], ended: torch.Tensor) -> None:
         """Add the mean over agents to the returns of the episodes, and log those that have ended."""
-        self._steps += len(ended)
+        self._steps += self.ranks.size * len(ended)
         self._totals = self._totals + torch.cat(list(rewards.values()), dim=1).mean(dim=1)
         returns = self._totals[ended].tolist()
         self.curve.steps += [self._steps] * len(returns)
         self.curve.returns += returns
         self._totals[ended] = 0.0
+
+    def _merge_curves(self) -> None:
+        """Add the episodes of this rollout that have ended on other ranks to the curve of rank 0."""
+        new, curve = slice(self._merged, None), self.curve
+        parts = self.ranks.gather(list(zip(curve.steps[new], curve.returns[new], strict=True)))
+        if self.ranks.first:
+            ended = sorted(chain(*parts), key=itemgetter(0))
+            curve.steps[new], curve.returns[new] = [steps for steps, _ in ended], [value for _, value in ended]
+        self._merged = len(curve.steps)
 
     def post_interaction(self, *, timestep: int, timesteps: int) -> None:
         """Learn at the end of a rollout, and write the checkpoint every so many iterations and at the end.
@@ -126,13 +141,14 @@ class WorldMAPPO(MAPPO):
         if self._rollout % self.cfg.rollouts == 0:
             self.iterations += 1
             self._check_finite()
+            self._merge_curves()
             self.curve.seconds = time.monotonic() - self._begun
             if self.checkpoint is None:
                 return
-            ends = timestep + 1 == timesteps or self.checkpoint.stop.made
+            ends = self.checkpoint.stop.asked() or timestep + 1 == timesteps
             if ends or self.iterations % self.checkpoint_every == 0:
-                self.checkpoint.save(self._state())
-            self.checkpoint.stop.obey(self.checkpoint.reached)
+                self.checkpoint.save(self._shared_state(), self._own_state())
+                self.checkpoint.stop.obey(self.checkpoint.reached)
 
     def _check_finite(self) -> None:
         networks = {f"{name} {part}": network for name, own in self.models.items() for part, network in own.items()}
@@ -140,16 +156,22 @@ class WorldMAPPO(MAPPO):
         rate = "mappo.learning_rate", self.cfg.learning_rate[self.possible_agents[0]][0]
         check_finite(networks, {"an action": actions}, self._steps, rate, self.checkpoint and self.checkpoint.path)
 
-    def _state(self) -> dict[str, Any]:
+    def _shared_state(self) -> dict[str, Any]:
+        """Return what is the same on all ranks, or rank 0's to write."""
         return {
             "iterations": self.iterations,
             "agents": {
                 name: {part: module.state_dict() for part, module in modules.items()}
                 for name, modules in self._modules()
             },
+            "curve": self.curve.state(),
+        }
+
+    def _own_state(self) -> dict[str, Any]:
+        """Return what every rank has of its own."""
+        return {
             "envs": self.env.host.get_state(),
             "playing": [self._steps, self._totals],
-            "curve": self.curve.state(),
             "random": random_states(),
         }
 
@@ -172,17 +194,18 @@ class WorldMAPPO(MAPPO):
         self._steps, totals = saved["playing"]
         self._totals = totals.to(self.device)
         self.curve.load(saved["curve"])
+        self._merged = len(self.curve.steps)
         self._begun = time.monotonic() - self.curve.seconds
         set_random_states(saved["random"])
 
 
 def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
-    """Train the agents of a world.
+    """Train the agents of a world; to be called on all ranks.
 
     Args:
         config: resolved.
         task: the world's.
-        folder: where to write; exists.
+        folder: where rank 0 writes; exists.
         device: where to simulate and to learn.
         checkpoint: from which to go on, and which to keep up.
 
@@ -190,10 +213,13 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
         ConfigError: an unknown term to observe, or a checkpoint with more iterations than are configured.
         Diverged: the networks are not finite any more.
     """
-    env = Worlds(type(task), config.num_envs, device, task.config)
+    ranks = checkpoint.ranks
+    enter(ranks)
+    env = Worlds(type(task), config.num_envs, device, task.config, ranks.threads)
     seed_all(config.seed)
-    skrl_config.torch.key = config.first_seed  # what skrl's wrapper seeds the worlds with
+    skrl_config.torch.key = config.first_seed_on(ranks)  # what skrl's wrapper seeds the worlds with
     mappo = build(config, env, folder, checkpoint)
+    config.seed_draws(ranks)
     left = config.iterations - iterations_of(checkpoint, config.iterations)
     trainer = SequentialTrainer(
         env=wrap_env(env, wrapper="isaaclab-multi-agent", verbose=False),
@@ -205,14 +231,23 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
             "close_environment_at_exit": False,
         },
     )
-    write_config(folder, config)
+    if ranks.first:
+        write_config(folder, config)
     mappo.resume()
     with checkpoint.stop.listening():
         trainer.train()
-    mappo.curve.train_steps = config.iterations * config.num_envs * config.mappo.rollout_steps
-    write_atomically(folder / "policy.pt", mappo.save)
+    mappo.curve.train_steps = ranks.size * config.iterations * config.num_envs * config.mappo.rollout_steps
+    if ranks.first:
+        write_atomically(folder / "policy.pt", mappo.save)
     env.close()
     return Learned(joint_agent(mappo), mappo.curve)
+
+
+def enter(ranks: Ranks) -> None:
+    """Let skrl reduce gradients over the group that has been joined."""
+    own = skrl_config.torch
+    own._rank, own._local_rank, own._world_size = ranks.rank, ranks.local_rank, ranks.size
+    own._is_distributed = ranks.size > 1
 
 
 def build(config: MAPPOTraining, env: Worlds, folder: Path, checkpoint: Checkpoint | None = None) -> WorldMAPPO:
@@ -222,6 +257,7 @@ def build(config: MAPPOTraining, env: Worlds, folder: Path, checkpoint: Checkpoi
         ConfigError: there is no such term to observe.
     """
     settings, layout, names = config.mappo, env.observation_layout, env.possible_agents
+    ranks = checkpoint.ranks if checkpoint else ALONE
     seen = components(layout, config.observe)
     of_all = [agent * layout.size + index for agent in range(env.num_agents) for index in seen]
     return WorldMAPPO(
@@ -236,7 +272,7 @@ def build(config: MAPPOTraining, env: Worlds, folder: Path, checkpoint: Checkpoi
             }
             for name in names
         },
-        memories={name: ActedMemory(settings.rollout_steps, config.num_envs, env.device) for name in names},
+        memories={name: ActedMemory(settings.rollout_steps, config.num_envs, env.device, ranks) for name in names},
         observation_spaces=env.observation_spaces,
         state_spaces=dict.fromkeys(names, env.state_space),
         action_spaces=env.action_spaces,
