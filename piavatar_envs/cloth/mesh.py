@@ -89,6 +89,20 @@ class ClothMesh:
         """Number of colors of the edges."""
         return len(self.color_start) - 1
 
+    @property
+    def sides(self) -> np.ndarray:
+        """Edges between corners 01, 12 and 20 of each triangle, shape ``(T, 3)``."""
+        ends = np.sort(self.edges, axis=1).astype(np.int64)
+        key = ends[:, 0] * self.num_vertices + ends[:, 1]
+        order = np.argsort(key)
+        side = np.sort(np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=2), axis=2).astype(np.int64)
+        return order[np.searchsorted(key[order], side[..., 0] * self.num_vertices + side[..., 1])]
+
+    @property
+    def face_area(self) -> np.ndarray:
+        """Areas of the triangles [m^2], shape ``(T,)``."""
+        return _areas(self.length[self.sides])
+
     def strain(self, positions: np.ndarray) -> np.ndarray:
         """Return how much longer than in the pattern the edges are, relative to it.
 

@@ -23,56 +23,34 @@ from piavatar_envs.mpm.types import FAILURE_CLOTH, Boundaries
 FABRIC_FIELDS = ("areal_density", "stretch", "bending", "friction", "drag", "skin_drag")
 
 
-class Cloth:
-    """All garments of a world, their vertices one garment after another.
+class Textile:
+    """All garments of a world on a device, their vertices one garment after another: what every solver needs of them.
 
     Attributes:
+        garments: in this order.
         mesh: of all garments together.
         first: first vertex of each garment, and the number of vertices, shape ``(G + 1,)``.
         state: positions, velocities and nearest points.
         length: rest lengths of the edges of ``mesh`` [m], shape ``(rows, M)``.
         fabric: properties of the garments, ``(rows, G)`` each; written to at a reset if they differ by environment.
+        settings: numerical parameters.
     """
 
     def __init__(
         self,
         garments: Sequence[Garment],
-        obstacles: Obstacles | None = None,
-        boundaries: Boundaries | None = None,
-        settings: ClothSettings | None = None,
-        *,
-        num_envs: int = 1,
-        control_dt: float = 1.0 / 30.0,
-        gravity: Sequence[float] = (0.0, 0.0, -9.81),
-        device: str = "cpu",
-        rows: int = 1,
+        settings: ClothSettings | None,
+        num_envs: int,
+        control_dt: float,
+        device: str,
+        rows: int,
+        first_face: np.ndarray,
     ) -> None:
-        """Upload the garments, draped and at rest.
-
-        Args:
-            garments: at least one.
-            obstacles: surfaces that they touch; None for none.
-            boundaries: floor and other colliders; None for none.
-            settings: numerical parameters; the usual ones if None.
-            num_envs: environments.
-            control_dt: control step [s].
-            gravity: acceleration [m/s^2].
-            device: Warp device.
-            rows: 1 for the same lengths and fabrics in all environments, else ``num_envs``.
-
-        Raises:
-            ValueError: a garment is worn by a piece that the obstacles lack.
-        """
+        """Upload the garments, draped and at rest; ``first_face`` has the first triangle of each wearer's piece."""
         self.garments, self.settings = tuple(garments), settings or ClothSettings()
         self.num_envs, self.control_dt, self.device = num_envs, control_dt, device
         self.mesh = joined([garment.mesh for garment in garments])
         self.first = np.cumsum([0, *(garment.mesh.num_vertices for garment in garments)])
-        self._obstacles = no_obstacles(num_envs, device) if obstacles is None else obstacles
-        self._boundaries = make_boundaries([], 1, 1, device) if boundaries is None else boundaries
-        pieces = len(self._obstacles.piece_start) - 1
-        for garment in garments:
-            if garment.wearer >= pieces:
-                raise ValueError(f"a {garment.kind} is worn by piece {garment.wearer}; the obstacles have {pieces}")
         draped = np.concatenate([garment.draped for garment in garments])
         shape = (num_envs, self.mesh.num_vertices)
         self.state = fill(
@@ -85,33 +63,8 @@ class Cloth:
         for name in FABRIC_FIELDS:
             values = np.array([[getattr(garment.fabric, name) for garment in garments]])
             setattr(self.fabric, name, self._floats(np.repeat(values, rows, axis=0)))
-        self._pattern = self._upload(rows)
+        self._pattern = self._upload(rows, first_face)
         self.length = self._pattern.length
-        self._constants = self._make_constants(gravity)
-        self._workspace, self._touches = self._allocate()
-        enabled = self.settings.self_collision
-        self._self_contacts = allocate_self_contacts(self.mesh, num_envs, device, enabled)
-
-    def record_step(self, graph: LaunchGraph, failure: wp.array, failure_bit: int = FAILURE_CLOTH) -> None:
-        """Append the launch that advances the cloth by a control step.
-
-        Failed environments are not advanced. What cloth gives to the obstacles is added to their ``impulse``.
-
-        Args:
-            graph: to append to.
-            failure: causes of failures, shape ``(num_envs,)`` int32.
-            failure_bit: that is set where a position or a velocity is not finite.
-        """
-        threads = self.threads
-        inputs = [self._pattern, self._constants, self.fabric, self._boundaries, failure_bit]
-        changed = [self._obstacles, self.state, self._workspace, self._touches, self._self_contacts, failure]
-        kernel = advance_kernel(self.settings.self_collision)
-        graph.launch(kernel, (self.num_envs, threads), inputs, changed, block_dim=threads)
-
-    @property
-    def threads(self) -> int:
-        """Threads of an environment: a CUDA block, one on a CPU."""
-        return THREADS if wp.get_device(self.device).is_cuda else 1
 
     @property
     def mass(self) -> np.ndarray:
@@ -124,14 +77,13 @@ class Cloth:
         """Return the arrays that a checkpoint stores, by name."""
         return {"x": self.state.x, "v": self.state.v, "near": self.state.near}
 
-    def _upload(self, rows: int) -> Pattern:
+    def _upload(self, rows: int, first_face: np.ndarray) -> Pattern:
         mesh, garments = self.mesh, self.garments
         garment = np.repeat(np.arange(len(garments)), np.diff(self.first))
         held = [each.held for each in garments]
         held_vertex = np.concatenate([each.vertices + at for each, at in zip(held, self.first, strict=False)])
         index = np.full(mesh.num_vertices, -1)
         index[held_vertex] = np.arange(len(held_vertex))
-        first_face = first_faces(self._obstacles)
         fans = np.concatenate([np.roll(mesh.faces, -shift, axis=1) for shift in range(3)])
         fans = fans[np.argsort(fans[:, 0], kind="stable")]
         integers = {
@@ -164,6 +116,81 @@ class Cloth:
             **{name: self._integers(values) for name, values in integers.items()},
             **{name: self._floats(values) for name, values in floats.items()},
         )
+
+    def _integers(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.device)
+
+    def _floats(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=float, device=self.device)
+
+    def _vectors(self, values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self.device)
+
+
+class Cloth(Textile):
+    """All garments of a world, advanced by small steps of extended position-based dynamics; see :class:`Textile`."""
+
+    def __init__(
+        self,
+        garments: Sequence[Garment],
+        obstacles: Obstacles | None = None,
+        boundaries: Boundaries | None = None,
+        settings: ClothSettings | None = None,
+        *,
+        num_envs: int = 1,
+        control_dt: float = 1.0 / 30.0,
+        gravity: Sequence[float] = (0.0, 0.0, -9.81),
+        device: str = "cpu",
+        rows: int = 1,
+    ) -> None:
+        """Upload the garments, draped and at rest.
+
+        Args:
+            garments: at least one.
+            obstacles: surfaces that they touch; None for none.
+            boundaries: floor and other colliders; None for none.
+            settings: numerical parameters; the usual ones if None.
+            num_envs: environments.
+            control_dt: control step [s].
+            gravity: acceleration [m/s^2].
+            device: Warp device.
+            rows: 1 for the same lengths and fabrics in all environments, else ``num_envs``.
+
+        Raises:
+            ValueError: a garment is worn by a piece that the obstacles lack.
+        """
+        self._obstacles = no_obstacles(num_envs, device) if obstacles is None else obstacles
+        self._boundaries = make_boundaries([], 1, 1, device) if boundaries is None else boundaries
+        pieces = len(self._obstacles.piece_start) - 1
+        for garment in garments:
+            if garment.wearer >= pieces:
+                raise ValueError(f"a {garment.kind} is worn by piece {garment.wearer}; the obstacles have {pieces}")
+        super().__init__(garments, settings, num_envs, control_dt, device, rows, first_faces(self._obstacles))
+        self._constants = self._make_constants(gravity)
+        self._workspace, self._touches = self._allocate()
+        enabled = self.settings.self_collision
+        self._self_contacts = allocate_self_contacts(self.mesh, num_envs, device, enabled)
+
+    def record_step(self, graph: LaunchGraph, failure: wp.array, failure_bit: int = FAILURE_CLOTH) -> None:
+        """Append the launch that advances the cloth by a control step.
+
+        Failed environments are not advanced. What cloth gives to the obstacles is added to their ``impulse``.
+
+        Args:
+            graph: to append to.
+            failure: causes of failures, shape ``(num_envs,)`` int32.
+            failure_bit: that is set where a position or a velocity is not finite.
+        """
+        threads = self.threads
+        inputs = [self._pattern, self._constants, self.fabric, self._boundaries, failure_bit]
+        changed = [self._obstacles, self.state, self._workspace, self._touches, self._self_contacts, failure]
+        kernel = advance_kernel(self.settings.self_collision)
+        graph.launch(kernel, (self.num_envs, threads), inputs, changed, block_dim=threads)
+
+    @property
+    def threads(self) -> int:
+        """Threads of an environment: a CUDA block, one on a CPU."""
+        return THREADS if wp.get_device(self.device).is_cuda else 1
 
     def _make_constants(self, gravity: Sequence[float]) -> Constants:
         settings = self.settings
@@ -204,15 +231,6 @@ class Cloth:
             **{name: vectors(slots * vertices) for name in ("point", "way", "normal", "impulse", "moment")},
         )
         return workspace, touches
-
-    def _integers(self, values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.device)
-
-    def _floats(self, values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, np.float32), dtype=float, device=self.device)
-
-    def _vectors(self, values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self.device)
 
 
 def bytes_of_cloth(mesh: ClothMesh, slots: int, self_collision: bool = False) -> int:
