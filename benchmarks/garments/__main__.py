@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from benchmarks import runner
-from benchmarks.garments import free, worn  # noqa: F401  (register their checks)
+from benchmarks.garments import free, mpm, worn  # noqa: F401  (register their checks)
 from benchmarks.garments.picture import draw
 from benchmarks.garments.rows import CHECKS, Options
 from benchmarks.physics.checks import FAILS, chosen, table

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -94,9 +95,9 @@ def stretch(options: Options) -> Iterator[Quantity]:
         yield at_most(f"{name}, any time", np.max(found), most, "%", theory=0.0)
 
 
-def flutter_of(flare: float, options: Options) -> dict[str, float]:
+def flutter_of(flare: float, options: Options, **settings: Any) -> dict[str, float]:
     """Return lag behind the waist [deg], lift of the hem [m] and its speed after the stop [m/s] of a skirt spun."""
-    dressed = spinning([SKIRT | {"flare": flare}], options)
+    dressed = spinning([SKIRT | {"flare": flare}], options, **settings)
     loops = boundary_loops(dressed.mesh.faces)
     waist = dressed.held
     (hem,) = (loop for loop in loops if not np.isin(loop, waist).any())

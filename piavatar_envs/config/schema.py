@@ -382,11 +382,25 @@ class ClothConfig(BaseModel):
 
     model_config = FROZEN
 
-    solver: Literal["xpbd"] = Field("xpbd", description="xpbd: extended position-based dynamics with small steps")
+    solver: Literal["xpbd", "mpm"] = Field(
+        "xpbd",
+        description="xpbd: extended position-based dynamics with small steps; mpm: a thin shell on the grid of the "
+        "bodies, for fine grids and comparisons",
+    )
     substeps: int = Field(20, ge=1, le=1000, description="substeps of cloth in a control step, of which 20 suit 1/30 s")
     sweeps: int = Field(4, ge=1, le=100, description="sweeps over the edges in a substep; with fewer, cloth may buzz")
     self_collision: bool = Field(False, description="keep garments apart from themselves and each other")
     wind: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="velocity of the air [m/s]")
+
+    @model_validator(mode="after")
+    def _refuse_what_has_no_effect(self) -> ClothConfig:
+        """Refuse settings of the other solver."""
+        for name in ("substeps", "sweeps", "self_collision") if self.solver == "mpm" else ():
+            value = getattr(self, name)
+            if value != type(self).model_fields[name].default:
+                shown = str(value).lower() if isinstance(value, bool) else value
+                raise ConfigError(f"cloth.{name}={shown} has no effect with cloth.solver='mpm'; leave it out")
+        return self
 
 
 class ShapeConfig(BaseModel):

@@ -47,6 +47,7 @@ class Fields:
         gate: gap between the surfaces of two fields below which they are in contact [grid spacings]; from 3 on any.
         normals: ``"shared"`` (one normal a pair) or ``"own"`` (the paper's rule, which loses momentum).
         num_sensors: rows of the contact sensor that particles refer to.
+        apart: fields that never merge with the trunk of their subject, such as garments; their density is their own.
     """
 
     subject: Sequence[int] = (0,)
@@ -55,6 +56,7 @@ class Fields:
     gate: float = BODY_CONTACT_GATE
     normals: str = "shared"
     num_sensors: int = 0
+    apart: Sequence[int] = ()
 
     @property
     def num_fields(self) -> int:
@@ -83,8 +85,9 @@ class Fields:
         if not np.all(np.asarray(self.friction) >= 0.0):
             raise ValueError(f"friction={np.min(self.friction):g} between bodies must not be negative")
         density = np.broadcast_to(np.asarray(self.density, float), (self.num_fields,))
+        merging = ~np.isin(np.arange(self.num_fields), self.apart)
         for subject in range(self.num_subjects):
-            own = density[np.array(self.subject) == subject]
+            own = density[(np.array(self.subject) == subject) & merging]
             if np.ptp(own) > 0.0:
                 raise ValueError(
                     f"density={own.tolist()} of the fields of subject {subject}: fields that grow together share one "

@@ -29,7 +29,7 @@ from piavatar_envs.cloth.mesh import ClothMesh
 from piavatar_envs.cloth.obstacles import ObstacleSurfaces, Piece, bytes_of_obstacles
 from piavatar_envs.cloth.proxy import ALL_PARTS, PROXY_VERTICES, proxy_of
 from piavatar_envs.cloth.remesh import remesh
-from piavatar_envs.cloth.solver import Cloth, bytes_of_cloth
+from piavatar_envs.cloth.solver import Cloth, Textile, bytes_of_cloth
 from piavatar_envs.cloth.types import ClothSettings, ClothState
 from piavatar_envs.config import ClothConfig, ConfigError, EnvConfig, GarmentConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -71,75 +71,60 @@ def tailor(config: EnvConfig, flesh: Sequence[Flesh]) -> list[Garment]:
     return garments
 
 
-class Garments:
-    """All garments of a world.
+class WornCloth:
+    """All garments of a world, whatever solver moves them: how a reset places them, and what a checkpoint stores.
 
     Attributes:
         garments: in the order of their avatars.
-        surfaces: skins of all avatars and surfaces of all props.
         cloth: the garments, simulated.
+        graded: whether random shapes change lengths.
+        reacts_at_end: whether bodies receive impulses after the last substep.
     """
+
+    reacts_at_end = False
 
     def __init__(
         self,
         garments: Sequence[Garment],
-        config: ClothConfig,
+        cloth: Textile,
         flesh: Sequence[Flesh],
         avatars: Sequence[Avatar],
-        props: PropSet,
         shapes: Shapes,
         model: Model,
         state: State,
     ) -> None:
-        """Allocate the cloth; nothing is placed until the first reset.
+        """Upload what places the garments; nothing is placed until the first reset.
 
         Args:
             garments: of :func:`tailor`, at least one.
-            config: settings of the solver.
+            cloth: of these garments.
             flesh: of the world, as all that follows.
             avatars: likewise.
-            props: likewise.
             shapes: likewise.
             model: likewise.
             state: likewise.
         """
-        self.garments, self._model, self._state = tuple(garments), model, state
-        bodies = enumerate(zip(flesh, avatars, strict=True))
-        pieces = [avatar_piece(index, *body, shapes, state) for index, body in bodies]
-        pieces += [prop_piece(column, props, state) for column in range(len(props))]
-        self.surfaces = ObstacleSurfaces(pieces, model)
-        self._graded = any(flesh[garment.wearer].shape.randomize for garment in garments)
-        self.cloth = Cloth(
-            garments,
-            self.surfaces.obstacles,
-            model.boundaries,
-            ClothSettings(config.substeps, config.sweeps, wind=config.wind, self_collision=config.self_collision),
-            num_envs=model.num_envs,
-            control_dt=model.control_dt,
-            gravity=tuple(model.step.gravity),
-            device=model.device,
-            rows=model.num_envs if self._graded else 1,
-        )
+        self.garments, self.cloth, self._model, self._state = tuple(garments), cloth, model, state
+        self.graded = is_graded(garments, flesh)
         self._worn = [
             _Worn(garment, flesh[garment.wearer], avatars[garment.wearer], shapes, state) for garment in garments
         ]
         self._chosen = wp.zeros(model.num_envs, dtype=int, device=model.device)
         draped = np.concatenate([garment.draped for garment in garments])
-        edges = self.cloth.mesh.edges
+        edges = cloth.mesh.edges
         span = np.linalg.norm(draped[edges[:, 0]] - draped[edges[:, 1]], axis=1)
         self._edges = wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=model.device)
         # length of the pattern over that in the drape
-        self._ease = wp.array((self.cloth.mesh.length / span).astype(np.float32), dtype=float, device=model.device)
+        self._ease = wp.array((cloth.mesh.length / span).astype(np.float32), dtype=float, device=model.device)
 
     def record_begin(self, graph: LaunchGraph) -> None:
-        """Append the start of a control step: the surfaces as they are before the bodies move."""
-        self.surfaces.record_start(graph)
+        """Append the start of a control step, before the bodies move."""
+
+    def record_before_substep(self, graph: LaunchGraph) -> None:
+        """Append what precedes a substep of the bodies."""
 
     def record_end(self, graph: LaunchGraph) -> None:
-        """Append the end of a control step: cloth follows the surfaces, and particles receive its impulses."""
-        self.surfaces.record_end(graph)
-        self.cloth.record_step(graph, self._state.failure)
-        self.surfaces.record_reaction(graph, self._state)
+        """Append the end of a control step, after the bodies have moved."""
 
     def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
         """Append the placement of garments in the masked environments: draped, in the pose of the wearer, at rest.
@@ -148,7 +133,7 @@ class Garments:
         """
         state, n = self.cloth.state, self._model.num_envs
         graph.launch(lay_down, state.x.shape, [mask], [self._chosen, state])
-        if self._graded:
+        if self.graded:
             for worn, first in zip(self._worn, self.cloth.first, strict=False):
                 inputs = [self._chosen, worn.surface, worn.motion.shape, int(first)]
                 graph.launch(grade_places, (n, worn.count), inputs, [state.x])
@@ -161,7 +146,72 @@ class Garments:
     def arrays(self) -> dict[str, wp.array]:
         """Return the arrays of a checkpoint by name."""
         found = {f"cloth.{name}": array for name, array in self.cloth.arrays().items()}
-        return found | ({"cloth.length": self.cloth.length} if self._graded else {})
+        return found | ({"cloth.length": self.cloth.length} if self.graded else {})
+
+
+def is_graded(garments: Sequence[Garment], flesh: Sequence[Flesh]) -> bool:
+    """Return whether an avatar that wears a garment has random shapes."""
+    return any(flesh[garment.wearer].shape.randomize for garment in garments)
+
+
+class Garments(WornCloth):
+    """All garments of a world by :class:`~piavatar_envs.cloth.solver.Cloth`, which follows the bodies.
+
+    Attributes:
+        surfaces: skins of all avatars and surfaces of all props.
+    """
+
+    reacts_at_end = True
+
+    def __init__(
+        self,
+        garments: Sequence[Garment],
+        config: ClothConfig,
+        flesh: Sequence[Flesh],
+        avatars: Sequence[Avatar],
+        props: PropSet,
+        shapes: Shapes,
+        model: Model,
+        state: State,
+    ) -> None:
+        """Allocate the cloth and the surfaces that it touches.
+
+        Args:
+            garments: of :func:`tailor`, at least one.
+            config: settings of the solver.
+            flesh: of the world, as all that follows.
+            avatars: likewise.
+            props: likewise.
+            shapes: likewise.
+            model: likewise.
+            state: likewise.
+        """
+        bodies = enumerate(zip(flesh, avatars, strict=True))
+        pieces = [avatar_piece(index, *body, shapes, state) for index, body in bodies]
+        pieces += [prop_piece(column, props, state) for column in range(len(props))]
+        self.surfaces = ObstacleSurfaces(pieces, model)
+        cloth = Cloth(
+            garments,
+            self.surfaces.obstacles,
+            model.boundaries,
+            ClothSettings(config.substeps, config.sweeps, wind=config.wind, self_collision=config.self_collision),
+            num_envs=model.num_envs,
+            control_dt=model.control_dt,
+            gravity=tuple(model.step.gravity),
+            device=model.device,
+            rows=model.num_envs if is_graded(garments, flesh) else 1,
+        )
+        super().__init__(garments, cloth, flesh, avatars, shapes, model, state)
+
+    def record_begin(self, graph: LaunchGraph) -> None:
+        """Append the start of a control step: the surfaces as they are before the bodies move."""
+        self.surfaces.record_start(graph)
+
+    def record_end(self, graph: LaunchGraph) -> None:
+        """Append the end of a control step: cloth follows the surfaces, and particles receive its impulses."""
+        self.surfaces.record_end(graph)
+        self.cloth.record_step(graph, self._state.failure)
+        self.surfaces.record_reaction(graph, self._state)
 
 
 class _Worn:

@@ -253,7 +253,7 @@ class Randomization:
         )
         bones = {f"body_{index}.bone_mass": bone_mass, f"body_{index}.body_mass": total}
         self._kept |= {"matter.mass": mass, **bones}
-        fields = np.flatnonzero(contact.subject.numpy() == index)  # those of a subject are next to each other
+        fields = np.unique(self.model.particles.field.numpy()[own])  # next to each other; garments have their own
         self._scale(factor, contact, "density", "contact.density", slice(int(fields[0]), int(fields[-1]) + 1))
 
     def set_nominal_mass(self, avatar: int, env: int, mass: np.ndarray, bone_mass: np.ndarray) -> None:

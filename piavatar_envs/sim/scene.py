@@ -134,7 +134,7 @@ def assemble(
         num_sensors=len(flesh) * NUM_PARTS,
     )
     colliders = (*_colliders(scene, frictions[: len(names), len(names) :][owner]), *walls)
-    matter = replace(_join(parts, rows), field=field, seam=seam, sensor=_sensors(flesh, first))
+    matter = replace(join(parts, rows), field=field, seam=seam, sensor=_sensors(flesh, first))
     return Subjects(names, tuple(int(i) for i in first), matter, fields, colliders, solids)
 
 
@@ -246,7 +246,7 @@ def _colliders(scene: SceneConfig, frictions: np.ndarray) -> tuple[Collider, ...
     return (*ground, *others)
 
 
-def _join(parts: Sequence[MaterialPoints], rows: int) -> MaterialPoints:
+def join(parts: Sequence[MaterialPoints], rows: int) -> MaterialPoints:
     """Concatenate the matter of several subjects."""
 
     def side_by_side(name: str) -> np.ndarray:

@@ -29,12 +29,13 @@ from piavatar_envs.mpm.types import Model, Scratch, State
 from piavatar_envs.sim.bodies import Flesh, load_avatar, pose_control
 from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_places
 from piavatar_envs.sim.forces import Forces, Receivers
-from piavatar_envs.sim.garments import Garments, bytes_of_garments, tailor, worn_by
+from piavatar_envs.sim.garments import Garments, WornCloth, bytes_of_garments, tailor, worn_by
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
 from piavatar_envs.sim.randomize import Randomization, fastest_wave, limiting_wave
 from piavatar_envs.sim.resolution import GRID_PER_HEIGHT, check_sizes
 from piavatar_envs.sim.scene import Domain, assemble
 from piavatar_envs.sim.shapes import Shapes, check_shape_names
+from piavatar_envs.sim.shells import ShellGarments, bytes_of_shells, shell_matter, with_shells
 from piavatar_envs.sim.time_step import choose_substeps
 
 
@@ -161,6 +162,9 @@ class Simulation:
         differs = bool(self._solids) or any(flesh.shape.randomize for flesh in self.flesh)
         rows = self.num_envs if differs else 1
         self.subjects = assemble(self.scene, self.config.physics, names, self.flesh, self._prop_matter, walls, rows)
+        self._shells = shell_matter(self.config, self._tailored, self.dx)
+        if self._shells:
+            self.subjects = with_shells(self.subjects, self._tailored, self._shells, self.dx)
         props = zip(self.scene.props, self._solids, strict=True)
         check_sizes(self.dx, self.config.physics.fidelity, self.scene.colliders, props)
 
@@ -168,7 +172,11 @@ class Simulation:
         """Choose the time step and upload the constants of the continuum."""
         config, physics, subjects = self.config, self.config.physics, self.subjects
         rest = np.concatenate(
-            [*(flesh.points.rest[0] for flesh in self.flesh), *(points.rest for points in self._solids)]
+            [
+                *(flesh.points.rest[0] for flesh in self.flesh),
+                *(points.rest for points in self._solids),
+                *([self._shells.rest] if self._shells else []),
+            ]
         )
         matter = [flesh.matter() for flesh in self.flesh]
         wave, limiting = fastest_wave(config.randomize, matter), limiting_wave(config.randomize, matter, self.dx)
@@ -192,9 +200,7 @@ class Simulation:
             rest=rest,
             sound_speed=wave,
             limiting_speed=limiting,
-            more_bytes=bytes_of_garments(
-                [own.mesh for own in self._tailored], self.flesh, self._solids, self.config.cloth.self_collision
-            ),
+            more_bytes=self._bytes_of_garments(),
         )
         fields = self.model.contact.num_fields
         self.initial_colliders = make_boundaries(subjects.colliders, fields, self.num_envs, self.device)
@@ -221,12 +227,25 @@ class Simulation:
         first = self.subjects.first[count:-1]
         self.props = PropSet(self.scene.props, self._solids, self._prop_matter, first, columns, self.model)
 
-    def _dress(self) -> Garments | None:
+    def _bytes_of_garments(self) -> int:
+        """Estimate the memory of the garments of an environment besides their particles [bytes]."""
+        meshes = [own.mesh for own in self._tailored]
+        if self._shells:
+            return bytes_of_shells(meshes)
+        return bytes_of_garments(meshes, self.flesh, self._solids, self.config.cloth.self_collision)
+
+    def _dress(self) -> WornCloth | None:
         """Allocate the garments, whose fabrics vary as the settings say."""
         if not self._tailored:
             return None
-        of_world = self.flesh, self.avatars, self.props, self.shapes, self.model, self.state
-        garments = Garments(self._tailored, self.config.cloth, *of_world)
+        garments: WornCloth
+        if self._shells:
+            of_world = self.flesh, self.avatars, self.shapes, self.model, self.state, self.scratch
+            first = self.subjects.first[-1]
+            garments = ShellGarments(self._tailored, self._shells, self.config.cloth, *of_world, first)
+        else:
+            bodies = self.flesh, self.avatars, self.props, self.shapes, self.model, self.state
+            garments = Garments(self._tailored, self.config.cloth, *bodies)
         self.randomization.scale_cloth(garments.cloth.fabric)
         return garments
 
@@ -285,7 +304,7 @@ def record_control_step(
     scratch: Scratch,
     props: PropSet | None = None,
     forces: Forces | None = None,
-    garments: Garments | None = None,
+    garments: WornCloth | None = None,
 ) -> None:
     """Append one control step, after which avatars and props are tracked.
 
@@ -306,6 +325,8 @@ def record_control_step(
         )
         if forces:
             forces.record_before_substep(graph, state, step)
+        if garments:
+            garments.record_before_substep(graph)
         record_substep(graph, *simulated, step)
 
     def end(index: int, own: LaunchGraph) -> None:
@@ -322,6 +343,7 @@ def record_control_step(
         props.record_tracking(graph, state)
     if garments:
         garments.record_end(graph)
+    if garments and garments.reacts_at_end:
         # cloth has changed velocities
         graph.parallel_for_each(avatars, lambda avatar, own: avatar.record_tracking(own, state))
         if props:

@@ -95,6 +95,7 @@ def matter(**constants):
         ({"fields": Fields(friction=-0.1)}, "-0.1"),
         ({"fields": Fields(normals="mine")}, "'mine'"),
         ({"fields": Fields(gate=np.nan)}, "gate=nan"),
+        ({"fields": Fields(subject=(0, 0), density=np.array([1000.0, 8.0]))}, "share one reference density"),
     ],
 )
 def test_what_cannot_run_is_refused(model_of, settings, message):
@@ -151,3 +152,9 @@ def test_batch_that_does_not_fit_is_refused(monkeypatch):
     memory.check_memory(fits, 3000, 300, "cuda:0")
     with pytest.raises(ValueError, match=rf"{10 * fits} environments need .* GiB.*num_envs <= {fits}"):
         memory.check_memory(10 * fits, 3000, 300, "cuda:0")
+
+
+def test_a_field_that_never_merges_has_a_density_of_its_own():
+    fields = Fields(subject=(0, 0), density=np.array([1000.0, 8.0]), apart=(1,))
+    fields.check()
+    assert fields.upload(0.1, 1, "cpu").density.numpy().tolist() == [[1000.0, 8.0]]
