@@ -101,6 +101,7 @@ $(CLIENTS)/.installed: $(STAMP) tests/clients/requirements.txt
 
 clients-light: $(CLIENTS)/.installed
 	PYTHONPATH=$(CLIENTS) OMP_NUM_THREADS=1 NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest --durations 10 tests/clients
+	PYTHONPATH=$(CURDIR)/$(CLIENTS) OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_docs.py -k torchrl
 
 lint: install
 	$(BIN)/ruff check .
