@@ -58,9 +58,9 @@ class Neighbours:
 
 def make_neighbours(links: np.ndarray, count: int, device: str) -> Neighbours:
     """Upload the neighbours of ``count`` particles, from pairs of them, shape ``(L, 2)``."""
-    pairs = np.concatenate([links, links[:, ::-1]])
-    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-    arrays = {"particle": pairs[:, 1], "start": np.searchsorted(pairs[:, 0], np.arange(count + 1))}
+    first, second = np.concatenate([links, links[:, ::-1]]).astype(np.int64).T
+    pairs = np.sort(first * count + second)
+    arrays = {"particle": pairs % count, "start": np.searchsorted(pairs, count * np.arange(count + 1))}
     uploaded = {name: wp.array(v.astype(np.int32), dtype=int, device=device) for name, v in arrays.items()}
     return make_struct(Neighbours, **uploaded)
 

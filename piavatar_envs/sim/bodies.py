@@ -17,7 +17,7 @@ from piavatar_envs.avatar.body import sampling
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
-from piavatar_envs.avatar.body.flesh_stiffness import flesh_stiffness
+from piavatar_envs.avatar.body.flesh_stiffness import kept_stiffness
 from piavatar_envs.avatar.body.groups import flesh_of
 from piavatar_envs.avatar.body.muscles import make_muscles
 from piavatar_envs.avatar.body.pose_correctives import COARSEST, pose_correctives
@@ -204,16 +204,8 @@ class Flesh:
         sampled = self.sampled
         matter, points = self.matter(), self._points
         mu, lam = lame_parameters(matter.young_modulus[0], matter.poisson_ratio[0])
-        stiffness = flesh_stiffness(
-            points.rest[0],
-            self._volume[0],
-            points.joints[0],
-            sampled.links,
-            sampled.skin_joints,
-            sampled.skin_weights,
-            mu,
-            lam,
-        )
+        body = points.rest[0], self._volume[0], points.joints[0]
+        stiffness = kept_stiffness(*body, sampled.links, sampled.skin_joints, sampled.skin_weights, mu, lam)
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)
         rates = attachment_rates(sampled.depth, distance, firm, *control.flesh_rate)

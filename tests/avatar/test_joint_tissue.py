@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body import flesh_stiffness as stiffness_module
 from piavatar_envs.avatar.body.flesh_stiffness import flesh_stiffness
 from piavatar_envs.avatar.body.interpolation import rest_gradient
 from piavatar_envs.avatar.body.passive import passive_moments
@@ -134,6 +135,26 @@ def strained_energy(body, rotvec: np.ndarray) -> float:
     J = np.linalg.det(F[known])
     density = 0.5 * MU * ((F[known] ** 2).sum((1, 2)) - 3.0) - MU * np.log(J) + 0.5 * LAM * np.log(J) ** 2
     return float(density @ p.volumes[known])
+
+
+def test_flesh_stiffness_takes_only_joints_that_bend_their_flesh(body, monkeypatch):
+    # Counted instead of timed: strains of particles by joints, a few together, as large bodies have thousands.
+    asset, p = body
+    whole, counts, strains = np.ones(len(p)), [], stiffness_module._strains
+    skinning = p.skin_joints, p.skin_weights
+    given = p.rest_positions, p.volumes, asset.joints, p.links, *skinning, MU * whole, LAM * whole
+
+    def counted(rest, joints, share, along):
+        counts.append(len(joints) * along[0].shape[0])
+        return strains(rest, joints, share, along)
+
+    monkeypatch.setattr(stiffness_module, "_strains", counted)
+    together = flesh_stiffness(*given)
+    assert counts == [(NUM_JOINTS - 1) * len(p)]
+    counts.clear()
+    monkeypatch.setattr(stiffness_module, "AT_ONCE", 64)
+    np.testing.assert_allclose(flesh_stiffness(*given), together, rtol=1e-6, atol=1e-6 * np.abs(together).max())
+    assert sum(counts) < 0.5 * NUM_JOINTS * len(p)
 
 
 @pytest.mark.parametrize(("joint", "axis", "degrees", "error"), [

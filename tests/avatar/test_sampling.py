@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from piavatar_envs.avatar.body import sampling
 from piavatar_envs.avatar.body.asset import dense_weights, mesh_volume
 from piavatar_envs.avatar.body.sampling import (
     LIMB_GROUPS,
@@ -228,6 +229,53 @@ def test_morphing_is_exact_for_an_affine_change(asset, coarse):
     assert np.median(error) < 0.004 and error.max() < 0.015
     ratio = volumes / coarse.volumes / np.prod(stretch)
     assert np.median(np.abs(ratio - 1.0)) < 0.05
+
+
+def test_fewer_points_are_searched_than_a_body_has(asset, coarse, coarse_spacing, monkeypatch):
+    # Counted instead of timed: queries of the skin, and searches of the particle that is nearest to an interior point.
+    counts = {"skin": 0, "nearest": 0}
+
+    class Surface(ClosedSurface):
+        def query(self, points):
+            counts["skin"] += len(points)
+            return super().query(points)
+
+    class Tree(cKDTree):
+        def query(self, x, **options):
+            counts["nearest"] += len(x) * ("k" not in options)
+            return super().query(x, **options)
+
+    monkeypatch.setattr(sampling, "ClosedSurface", Surface)
+    monkeypatch.setattr(sampling, "cKDTree", Tree)
+    work = {}
+    for spacing in (coarse_spacing, coarse_spacing / 1.6):
+        counts.update(skin=0, nearest=0)
+        found = sampling._sample(asset, spacing, 0, 4, 1.0)
+        work[spacing] = {name: count / len(found["volumes"]) for name, count in counts.items()}
+        if spacing == coarse_spacing:  # the searches that are left out change no bit
+            np.testing.assert_array_equal(found["volumes"], coarse.volumes)
+    once, finer = work.values()
+    assert finer["nearest"] < once["nearest"] < 15.0  # of 27 in each cell
+    assert finer["skin"] < 0.9 * once["skin"]
+
+
+def test_the_mean_shape_is_not_solved_for(asset, coarse, monkeypatch):
+    monkeypatch.setattr(sampling, "fill", lambda *arguments: pytest.fail("a harmonic function of no displacement"))
+    rest, volumes = morph(asset, coarse, asset.mean_body())
+    np.testing.assert_array_equal(rest, coarse.rest_positions)
+    np.testing.assert_allclose(volumes, coarse.volumes, rtol=1e-6)
+
+
+def test_the_threads_of_a_solution_do_not_matter(asset, coarse, monkeypatch):
+    monkeypatch.setattr(sampling, "ROWS_AT_ONCE", 100)  # several blocks of rows
+    known, values = coarse.shell | (coarse.bone >= 0), dense_weights(coarse.skin_joints, coarse.skin_weights)
+    found = []
+    for threads in (1, 5):
+        monkeypatch.setattr(sampling, "available_cores", lambda threads=threads: threads)
+        found.append(sampling.fill(coarse.links, coarse.rest_positions.astype(float), values, known))
+    np.testing.assert_array_equal(*found)
+    whole = np.where(known[:, None], values, found[0])
+    assert np.abs(found[0] - whole).max() == 0.0 and np.abs(found[0].sum(axis=1) - 1.0).max() < 1e-4
 
 
 @pytest.mark.parametrize(("spacing", "rings", "message"), [(0.0, 4, "0.0"), (np.nan, 4, "nan"), (0.05, 3, "=3")])

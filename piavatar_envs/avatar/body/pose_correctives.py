@@ -114,15 +114,25 @@ def _fitted(asset: AvatarAsset, particles: ParticleSet) -> PoseCorrectives:
     """Fit the correctives, or interpolate those of other particles."""
     spacing = spacing_for(float(np.ptp(asset.vertices[:, 2])) / CELLS_PER_HEIGHT)
     if np.isclose(particles.spacing, spacing, rtol=0.01) and asset.surface_points is None:
-        return _listed(fit_correctives(particles, asset.joints.astype(float)))
+        every = np.arange(len(particles))
+        return _listed(((every, own) for own in fit_correctives(particles, asset.joints.astype(float))), len(every))
     plain = asset if asset.surface_points is None else replace(asset, surface_points=None)
     coarse = sample_particles(plain, spacing)
     fitted = fit_correctives(coarse, asset.joints.astype(float))
-    others, own = (dense_weights(one.skin_joints, one.skin_weights) for one in (particles, coarse))
-    places = (one.rest_positions.astype(float) for one in (particles, coarse))
-    matrix = interpolation_matrix(next(places), others, next(places), own, NEIGHBOURS)
-    matrix = sparse.diags(_yields(particles).astype(float)) @ matrix
-    return _listed(np.stack([matrix @ own[..., k] for k in range(6)], axis=-1) for own in fitted)
+    yields = np.flatnonzero(_yields(particles))
+    others = dense_weights(particles.skin_joints[yields], particles.skin_weights[yields])
+    weights = dense_weights(coarse.skin_joints, coarse.skin_weights)
+    places = particles.rest_positions[yields].astype(float), coarse.rest_positions.astype(float)
+    matrix = interpolation_matrix(places[0], others, places[1], weights, NEIGHBOURS)
+    return _listed((_interpolated(matrix, yields, own) for own in fitted), len(particles))
+
+
+def _interpolated(
+    matrix: sparse.csr_array, particles: np.ndarray, coefficients: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the particles to which the rows of an interpolation bring coefficients ``(P, 3, 6)``, and those."""
+    rows = np.flatnonzero(matrix @ coefficients.any(axis=(1, 2)).astype(float))
+    return particles[rows], (matrix[rows] @ coefficients.reshape(-1, 18)).reshape(-1, 3, 6)
 
 
 def _yields(particles: ParticleSet) -> np.ndarray:
@@ -197,13 +207,18 @@ def _projection(along: list[sparse.csr_matrix], free: np.ndarray):
     return project
 
 
-def _listed(fitted: Iterable[np.ndarray]) -> PoseCorrectives:
-    """Return the coefficients of each particle in a list, from those of each joint, without the negligible."""
-    particles, joints, found, count = [], [], [], 0
-    for joint, both in enumerate(fitted):
-        count, size = len(both), np.linalg.norm(both, axis=1)
+def _listed(fitted: Iterable[tuple[np.ndarray, np.ndarray]], count: int) -> PoseCorrectives:
+    """Return the coefficients of each of ``count`` particles in a list, without the negligible.
+
+    Args:
+        fitted: of each joint some particles, in order, and their coefficients ``(n, 3, 6)``.
+        count: particles of the body.
+    """
+    particles, joints, found = [], [], []
+    for joint, (which, both) in enumerate(fitted):
+        size = np.linalg.norm(both, axis=1)
         kept = np.flatnonzero(size[:, :3].max(axis=1) + size[:, 3:].max(axis=1) > LEAST)
-        particles.append(kept)
+        particles.append(which[kept])
         joints.append(np.full(len(kept), joint))
         found.append(both[kept])
     particle = np.concatenate(particles)

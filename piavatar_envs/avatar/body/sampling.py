@@ -13,6 +13,7 @@ be neighbours in the body: then the threads of a warp access the same nodes of t
 from __future__ import annotations
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -34,6 +35,7 @@ from piavatar_envs.avatar.body.asset import (
 )
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.skeleton_mesh import thinned
+from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.core.result_cache import digest_of, kept
 
 wp.set_module_options({"enable_backward": False})
@@ -210,6 +212,7 @@ def order_in_boxes(positions: np.ndarray) -> np.ndarray:
 
 
 TOLERANCE = 1e-6  # of the residual, relative to the right-hand side
+ROWS_AT_ONCE = 8192  # of a system, whose columns then stay in a core's cache
 MAX_ITERATIONS = 2000
 
 
@@ -258,27 +261,43 @@ def fill(links: np.ndarray, points: np.ndarray, values: np.ndarray, known: np.nd
 
 
 def _conjugate_gradient(matrix: sparse.csr_matrix, right: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Solve by conjugate gradients with a diagonal preconditioner, all columns at once; deterministic."""
+    """Solve by conjugate gradients with a diagonal preconditioner, all columns at once.
+
+    Blocks of rows are shared between threads. Sums are taken block by block, so that they do not depend on the threads.
+    """
+    blocks = [slice(first, first + ROWS_AT_ONCE) for first in range(0, len(right), ROWS_AT_ONCE)]
+    rows = [matrix[block] for block in blocks]
     inverse_diagonal = 1.0 / matrix.diagonal()[:, None]
     solution = guess.copy()
     residual = right - matrix @ solution
-    z = inverse_diagonal * residual
-    direction, product = z.copy(), np.empty_like(z)
-    energy = np.sum(residual * z, axis=0)
+    direction = inverse_diagonal * residual
+    image, energy = np.empty_like(direction), np.sum(residual * direction, axis=0)
+
+    def multiply(number: int) -> np.ndarray:
+        block = blocks[number]
+        image[block] = rows[number] @ direction
+        return np.sum(direction[block] * image[block], axis=0)
+
+    def advance(block: slice) -> np.ndarray:
+        solution[block] += step * direction[block]
+        residual[block] -= step * image[block]
+        return np.sum(residual[block] * (inverse_diagonal[block] * residual[block]), axis=0)
+
+    def turn(block: slice) -> None:
+        direction[block] *= gain
+        direction[block] += inverse_diagonal[block] * residual[block]
+
     limit = TOLERANCE * max(np.linalg.norm(right), 1e-12)
-    for _ in range(MAX_ITERATIONS):
-        if np.linalg.norm(residual) <= limit:
-            break
-        image = matrix @ direction
-        # a column that is already solved has a zero direction: leave it where it is
-        step = energy / np.maximum(np.sum(np.multiply(direction, image, out=product), axis=0), 1e-300)
-        solution += np.multiply(step, direction, out=product)
-        residual -= np.multiply(step, image, out=product)
-        np.multiply(inverse_diagonal, residual, out=z)
-        new_energy = np.sum(np.multiply(residual, z, out=product), axis=0)
-        direction *= new_energy / np.maximum(energy, 1e-300)
-        direction += z
-        energy = new_energy
+    with ThreadPoolExecutor(available_cores()) as pool:
+        for _ in range(MAX_ITERATIONS):
+            if np.linalg.norm(residual) <= limit:
+                break
+            # a column that is already solved has a zero direction: leave it where it is
+            step = energy / np.maximum(sum(pool.map(multiply, range(len(blocks)))), 1e-300)
+            new_energy = sum(pool.map(advance, blocks))
+            gain = new_energy / np.maximum(energy, 1e-300)
+            list(pool.map(turn, blocks))
+            energy = new_energy
     return solution
 
 
@@ -398,10 +417,11 @@ def sample_particles(
 def _sample(asset: AvatarAsset, spacing: float, seed: int, bone_rings: int, bone_voxel: float) -> dict[str, np.ndarray]:
     """Return the arrays of :class:`ParticleSet` by name."""
     skin = ClosedSurface(asset.vertices, asset.faces)
-    flesh, interior = _flesh_lattice(asset, skin, spacing, seed)
+    flesh, interior, cell = _flesh_lattice(asset, skin, spacing, seed)
     bones, bone_of = _bone_particles(asset, skin, bone_rings, spacing, bone_voxel)
     added = _no_points() if asset.surface_points is None else asset.surface_points
-    flesh = flesh[cKDTree(np.concatenate([bones, added.points])).query(flesh)[0] > BONE_CLEARANCE * spacing]
+    clear = cKDTree(np.concatenate([bones, added.points])).query(flesh)[0] > BONE_CLEARANCE * spacing
+    flesh = flesh[clear]
     positions = np.concatenate([bones, flesh, added.points]).astype(np.float32)
     bone = np.concatenate([bone_of, np.full(len(flesh) + len(added.points), -1)]).astype(np.int32)
     # the index of a particle among the points that the asset brings, or -1
@@ -417,7 +437,10 @@ def _sample(asset: AvatarAsset, spacing: float, seed: int, bone_rings: int, bone
     shell = (distance > -SHELL * spacing) | (brought >= 0)
     weights = fill(links, positions, surface, shell | (bone >= 0))
     skin_joints, skin_weights = top_weights(_local(weights))
-    volumes = _volumes(positions, bone, brought >= 0, interior, mesh_volume(asset.vertices, asset.faces))
+    # the particle of each cell of the lattice, or -1; the last entry is that of no cell
+    owner = np.append(np.where(clear, np.argsort(order)[len(bones) - 1 + np.cumsum(clear)], -1), -1)
+    total = mesh_volume(asset.vertices, asset.faces)
+    volumes = _volumes(positions, bone, brought >= 0, interior, owner[cell], total)
     depth = np.maximum(-distance, 0.0)
     order = order_of_body(positions, bone, skin_joints, skin_weights)
     links = np.argsort(order).astype(np.int32)[links]
@@ -440,7 +463,7 @@ def _no_points() -> SurfacePoints:
 
 
 def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple[np.ndarray, np.ndarray]:
-    """Move the particles of the mean shape into another shape of the same asset.
+    """Move the particles of the mean shape into a shape of the same asset.
 
     Particles near the skin follow their nearest skin point; the interior follows smoothly. Volumes change with the
     local stretch and add up to the shape's volume.
@@ -453,6 +476,10 @@ def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple
     Returns:
         Rest positions [m] ``(P, 3)`` and volumes [m^3] ``(P,)``, both float32.
     """
+    volume = mesh_volume(body.vertices, asset.faces)
+    if np.array_equal(body.vertices, asset.vertices):
+        same = particles.volumes.astype(np.float64)
+        return particles.rest_positions.copy(), (same * (volume / same.sum())).astype(np.float32)
     corners = particles.anchor_vertices
     displacement = (body.vertices - asset.vertices).astype(np.float64)[corners]
     guess = np.einsum("pc,pci->pi", particles.anchor_weights, displacement)
@@ -462,12 +489,16 @@ def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple
     inside = particles.depth > 0.0  # points that an asset brings may be outside of its skin
     moved[inside] = _pushed_inside(moved[inside], skin, asset.faces, body, INSET * particles.spacing)
     volumes = particles.volumes * volume_ratios(particles.links, rest, moved)
-    volumes *= mesh_volume(body.vertices, asset.faces) / volumes.sum()
+    volumes *= volume / volumes.sum()
     return moved.astype(np.float32), volumes.astype(np.float32)
 
 
-def _flesh_lattice(asset: AvatarAsset, skin: ClosedSurface, spacing: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return flesh particles ``(N, 3)`` and the finer lattice of interior points that measures volumes ``(M, 3)``."""
+def _flesh_lattice(asset: AvatarAsset, skin: ClosedSurface, spacing: float, seed: int) -> tuple[np.ndarray, ...]:
+    """Return flesh particles ``(N, 3)``, and the finer lattice of interior points that measures volumes.
+
+    Returns:
+        Flesh particles; interior points ``(M, 3)``; the particle in the cell of each of these, -1 for none, ``(M,)``.
+    """
     low, high = asset.vertices.min(axis=0), asset.vertices.max(axis=0)
     shift = np.random.default_rng(seed).uniform(0.0, spacing, 3) * [0.0, 1.0, 1.0]
     first = np.floor((low - shift) / spacing).astype(int)
@@ -489,11 +520,13 @@ def _flesh_lattice(asset: AvatarAsset, skin: ClosedSurface, spacing: float, seed
     share = inside[keep] / inside[keep].sum(axis=1, keepdims=True)
     flesh = np.einsum("nk,nki->ni", share, fine[keep])
     # The centroid of a cell that the skin cuts twice may lie in the gap: take the nearest interior point instead.
-    outside = skin.distance(flesh) > -0.02 * spacing
+    outside = distance[keep] >= -half_diagonal  # the others are the centres of whole cells
+    outside[outside] = skin.distance(flesh[outside]) > -0.02 * spacing
     gap = np.linalg.norm(fine[keep][outside] - flesh[outside][:, None], axis=-1)
     gap[~inside[keep][outside]] = np.inf
     flesh[outside] = fine[keep][outside][np.arange(outside.sum()), gap.argmin(axis=1)]
-    return flesh, fine[inside]
+    cell = np.repeat(np.where(keep, np.cumsum(keep) - 1, -1)[:, None], len(offsets), axis=1)
+    return flesh, fine[inside], cell[inside]
 
 
 def _bone_ends(asset: AvatarAsset, skin: ClosedSurface) -> np.ndarray:
@@ -593,7 +626,8 @@ def _links(
     if len(others):
         near = lattice[tree.query(positions[others], k=SURFACE_LINKS)[1]]
         links = np.concatenate([links, np.sort(np.stack([np.repeat(others, SURFACE_LINKS), near.ravel()], axis=1))])
-    links = links[np.lexsort((links[:, 1], links[:, 0]))]
+    pair = np.sort(links[:, 0].astype(np.int64) * len(positions) + links[:, 1])
+    links = np.stack([pair // len(positions), pair % len(positions)], axis=1)
     joints = (surface > 0.0) @ (1 << np.arange(NUM_JOINTS))  # a bit for each
     links = links[(joints[links[:, 0]] & joints[links[:, 1]]) != 0]
     reach = 0.5 * np.linalg.norm(positions[links[:, 0]] - positions[links[:, 1]], axis=1)
@@ -615,14 +649,26 @@ def _local(weights: np.ndarray) -> np.ndarray:
 
 
 def _volumes(
-    positions: np.ndarray, bone: np.ndarray, brought: np.ndarray, interior: np.ndarray, total: float
+    positions: np.ndarray,
+    bone: np.ndarray,
+    brought: np.ndarray,
+    interior: np.ndarray,
+    likely: np.ndarray,
+    total: float,
 ) -> np.ndarray:
     """Return volumes [m^3] ``(P,)`` float32; each interior point counts for the nearest particle.
 
+    ``likely`` is a particle near each interior point, or -1. It is the nearest if the point is nearer to it than half
+    its distance from any other particle: only the other points need a search.
     The particles of one bone share theirs evenly: some are closer together than the interior points. So may those be
     that the asset has ``brought``; at least a twentieth of all is theirs.
     """
-    nearest = cKDTree(positions).query(interior, workers=-1)[1]
+    tree = cKDTree(positions)
+    gap = tree.query(positions, k=[2], workers=-1)[0][:, 0]
+    sure = likely >= 0
+    away = np.linalg.norm(interior[sure] - positions[likely[sure]], axis=1)
+    sure[sure] = 2.0 * away < (1.0 - 1e-6) * gap[likely[sure]]
+    nearest = np.concatenate([likely[sure], tree.query(interior[~sure], workers=-1)[1]])
     share = np.bincount(nearest, minlength=len(positions)).astype(np.float64)
     for joint in range(NUM_JOINTS):
         share[bone == joint] = share[bone == joint].mean()
