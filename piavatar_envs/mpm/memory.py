@@ -67,6 +67,8 @@ def estimate_active_blocks(rest: np.ndarray, field: np.ndarray | None, dx: float
             times = LARGE_MARGIN if len(own) > MOST_PARTICLES else ACTIVE_MARGIN
         base = np.floor(own / dx - 0.5).astype(int)
         base -= BLOCK * (base.min(axis=0) // BLOCK)
+        of_base = np.bincount(np.ravel_multi_index(base.T, base.max(axis=0) + 1))
+        base = np.stack(np.unravel_index(np.flatnonzero(of_base), base.max(axis=0) + 1), axis=1)  # each of them once
         counts = []
         for shift in np.ndindex(2, 2, 2):  # any alignment of the grid with the body
             touched = (base[:, None] + 2 * np.array(shift) + corners).reshape(-1, 3).T // BLOCK
