@@ -15,6 +15,7 @@ from scripts.pages.actions import actions_section
 from scripts.pages.entries import ROOT, Entry, Facts
 from scripts.pages.markdown import code, listed, number, page, sentence, table
 from scripts.pages.scene import scene_section
+from scripts.pages.scores import scores_section
 from scripts.pages.settings import Section, Setting, sections_of
 
 FOLDER = ROOT / "docs" / "envs"
@@ -85,6 +86,7 @@ def entry_page(entry: Entry, facts: Facts) -> str:
             _costs(entry),
             _episode(entry, facts),
             _info(entry, facts),
+            scores_section(entry, FOLDER),
             _arguments(entry, facts),
             "## Versions\n\n" + "\n".join(f"- {version}: {text}" for version, text in task.history),
         ]

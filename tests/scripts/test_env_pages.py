@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 
@@ -20,7 +21,7 @@ from piavatar_envs.mpm.types import FAILURE_NAMES
 from scripts import env_pages
 from scripts.pages.entries import Entry, Facts, entries, gather
 from scripts.pages.gaps import gaps
-from scripts.pages.text import FAILURE_DOCS, entry_page
+from scripts.pages.text import FAILURE_DOCS, FOLDER, entry_page
 
 ENTRIES = {entry.name: entry for entry in entries()}
 
@@ -144,3 +145,17 @@ def test_the_check_finds_stale_missing_and_surplus_files(tmp_path):
         (pictures / f"{name}.png").write_bytes(bytes(size))
     lines = env_pages.picture_faults(pictures, ["right", "blank", "missing"])
     assert [re.search(r"(\w+)\.png", line)[1] for line in lines] == ["blank", "missing", "surplus"]
+
+
+def test_scores_are_those_of_the_committed_results(page):
+    """Compare every mean return on a page with the files that its rows link to."""
+    _, _, text = page
+    table = rows(text, "Baseline scores")
+    assert {row[0].split(" against ")[0] for row in table} >= {"zero", "random"} and len(table) >= 3
+    for agent, _, shown, _, episodes, result in table:
+        file = (FOLDER / re.search(r"\((.*?)\)", result)[1]).resolve()
+        found = json.loads(file.read_text())["results"]
+        mean = float(shown.split(" (")[0])
+        same = [row for row in found if row["return_mean"] == pytest.approx(mean, abs=0.06)]
+        assert same, f"{agent}: no row of {file} has a return of {mean}"
+        assert int(episodes) in {row["episodes"] for row in same}
