@@ -103,6 +103,15 @@ class Ranks:
         distributed.all_reduce(least, op=distributed.ReduceOp.MIN)
         return int(least)
 
+    @contextmanager
+    def leaders_first(self) -> Iterator[None]:
+        """Let the first rank of every machine go ahead: it fills the caches of kernels and bodies for the others."""
+        if self.local_rank:
+            self.any(False)
+        yield
+        if not self.local_rank:
+            self.any(False)
+
     def add(self, values: torch.Tensor) -> torch.Tensor:
         """Sum a tensor over the ranks, in place."""
         if self.size > 1:

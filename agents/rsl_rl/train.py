@@ -350,7 +350,8 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
         Diverged: the networks are not finite any more.
     """
     ranks = checkpoint.ranks
-    env = make_env(config, task, device, ranks)
+    with ranks.leaders_first():
+        env = make_env(config, task, device, ranks)
     seed_all(config.seed)
     runner = Runner(env, config, folder, checkpoint)
     if ranks.first:

@@ -215,7 +215,8 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
     """
     ranks = checkpoint.ranks
     enter(ranks)
-    env = Worlds(type(task), config.num_envs, device, task.config, ranks.threads)
+    with ranks.leaders_first():
+        env = Worlds(type(task), config.num_envs, device, task.config, ranks.threads)
     seed_all(config.seed)
     skrl_config.torch.key = config.first_seed_on(ranks)  # what skrl's wrapper seeds the worlds with
     mappo = build(config, env, folder, checkpoint)

@@ -58,7 +58,11 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
         with tempfile.TemporaryDirectory() as folder:
             row = measure(count, options, Path(folder) / "run")
         first = first or row["env_steps_per_s"] / count
-        yield {"case": f"{count} ranks", **row, "efficiency": row["env_steps_per_s"] / count / first}
+        yield {
+            "case": "1 rank" if count == 1 else f"{count} ranks",
+            **row,
+            "efficiency": row["env_steps_per_s"] / count / first,
+        }
 
 
 def measure(count: int, options: Options, folder: Path) -> dict[str, Any]:

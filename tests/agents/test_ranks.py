@@ -173,6 +173,15 @@ def test_the_assist_of_all_ranks_spreads_as_over_one_batch():
     assert assists.tolist() == pytest.approx([0.0, 0.2, 0.4, 0.6])
 
 
+def test_the_first_rank_of_a_machine_builds_before_the_others(monkeypatch):
+    done: list[str] = []
+    monkeypatch.setattr(Ranks, "any", lambda self, flag: done.append("all are here"))
+    for place in (Ranks(2, 4, 0, 2), Ranks(3, 4, 1, 2)):
+        with place.leaders_first():
+            done.append(f"rank {place.rank} builds")
+    assert done == ["rank 2 builds", "all are here", "all are here", "rank 3 builds"]
+
+
 def test_ranks_make_as_many_minibatches_as_the_one_with_the_fewest(monkeypatch):
     monkeypatch.setattr(Ranks, "least", lambda self, number: min(number, self.size))
     memory = ActedMemory(memory_size=4, num_envs=2, device="cpu", ranks=Ranks(0, 2))
