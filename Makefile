@@ -8,7 +8,7 @@ EXTRAS := render,live,train,fit,motions,multi,props,skrl,rsl,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test test-lowest test-avatars test-vlm test-rllib clients-light lint format docs clean
+.PHONY: help install demo test test-lowest test-avatars test-vlm test-rllib test-live clients-light lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
@@ -18,6 +18,7 @@ help:
 	@echo "make test-avatars  compare avatars and motions with MakeHuman's data, body-models, pybvh and gsply"
 	@echo "make test-vlm      test the judge of agents.fit with a tiny vision-language model of transformers"
 	@echo "make test-rllib  test the ids and games with Ray's RLlib, also on two nodes of which one is killed"
+	@echo "make test-live     drive the live view in a headless Chromium (CHROMIUM=/path/to/it, or that of Playwright)"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
 	@echo "make lint      check style, format and the types of the public API; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code and build the site in build/site (PICTURES=1 draws the pages' pictures, too; CHECK=1 compares the pages only, LINKS=1 also visits the links to other sites)"
@@ -90,6 +91,17 @@ $(RLLIB)/.installed: $(STAMP) tests/rllib/requirements.txt
 
 test-rllib: $(RLLIB)/.installed
 	PYTHONPATH=$(CURDIR)/$(RLLIB):$(CURDIR) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/rllib tests/test_docs.py -k "rllib"
+
+# Browser automation in a folder of its own. Playwright's Chromium is fetched where this machine has none.
+BROWSER := $(VENV)/browser
+$(BROWSER)/.installed: $(STAMP) tests/live/requirements.txt
+	rm -rf $(BROWSER)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(BROWSER) --requirement tests/live/requirements.txt
+	@touch $@
+
+test-live: $(BROWSER)/.installed
+	test -n "$(CHROMIUM)" || command -v chromium || command -v chromium-browser || command -v google-chrome || PYTHONPATH=$(BROWSER) $(BIN)/python -m playwright install chromium
+	PYTHONPATH=$(BROWSER) CHROMIUM=$(CHROMIUM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/live/test_browser.py
 
 # Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
 # imports and compilation take longer than the tests.

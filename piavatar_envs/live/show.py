@@ -74,8 +74,8 @@ class Show:
         """
         setup = replace(setup, settings={**find_agent(setup.agent, kinds).needs, **setup.settings})
         self._kinds, self.setup, self.host = kinds, setup, setup.make()
+        words = self._adapt_control()
         first, color = self.host.groups[0], self.host.config.render.color
-        self._adapt_control()
         self.live = Live(first, self.host.apply_force, color, port, pace=pace)
         self.playing, self.speed, self.env = True, 1.0, 0
         self.played, self.steps, self.total = 0, 0, 0.0
@@ -89,6 +89,7 @@ class Show:
         self._populate()
         view = self.live.view
         self.panel = Panel(view.server, color, list(kinds), setup.agent, setup.num_envs, sliders(self.host))
+        self._say(words)
         view.on_throw(self._click)
         open_file = self.panel.send
         self._links = LinkServer(
@@ -123,13 +124,15 @@ class Show:
         groups = self.host.groups if self.setup.ball else []
         self._throwers = [Thrower(group.simulation, BALL) for group in groups]
 
-    def _adapt_control(self) -> None:
-        """Build the environments anew if the agent cannot act under their control."""
+    def _adapt_control(self) -> str:
+        """Build the environments anew if the agent cannot act under their control; return the reason, or nothing."""
         kind = self._kinds[self.setup.agent]
-        if self.host.config.control.mode not in kind.controls:
-            self.host.close()
-            self.setup = with_control(self.setup, kind.controls[0])
-            self.host = self.setup.make()
+        if self.host.config.control.mode in kind.controls:
+            return ""
+        self.host.close()
+        self.setup = with_control(self.setup, kind.controls[0])
+        self.host = self.setup.make()
+        return f"agent {self.setup.agent} needs control={kind.controls[0]!r}"
 
     def _select(self) -> None:
         """Let the view show the environment of :attr:`env`."""

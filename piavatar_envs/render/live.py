@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import math
@@ -67,6 +68,8 @@ def check_port(port: int) -> None:
         raise ValueError(f"port={port} is outside [1, {65536 - _TRIES}]")
 
 
+#: Time in which a browser that has connected takes over the first view [s].
+_SETTLE = 1.0
 #: Keys held while the left button drags a body, whatever the pointer does without them.
 DRAG_KEYS = "cmd/ctrl"
 #: Effects of the left button and of a finger, without keys, on a body or, for a throw, anywhere.
@@ -122,7 +125,7 @@ class LiveView:
         self._stop = weakref.finalize(self, _stop, self.server)
         self.url = f"http://{HOST}:{self.server.get_port()}"
         self._set_up(self._follower.camera)
-        self.server.on_client_connect(_fit)
+        self.server.on_client_connect(_fitter(self._follower.camera))
         print(f"live view: {self.url}", flush=True)
 
     def _set_up(self, camera: Camera) -> None:
@@ -274,18 +277,31 @@ class LiveView:
         self._stop()
 
 
-async def _fit(client: viser.ClientHandle) -> None:
-    """Move the first camera of a window that is higher than wide back and up, above the panel at its foot."""
-    camera = client.camera
-    wide = camera.aspect
-    if wide >= 1.0:
-        return
-    eye, target = np.array(camera.position), np.array(camera.look_at)
-    away = 1.2 / max(wide, 0.3) * (eye - target)
-    # the lower half of the window shows the panel
-    target = target - [0.0, 0.0, 0.25 * float(np.linalg.norm(away)) * math.tan(camera.fov / 2.0) * 2.0]
-    with client.atomic():
-        camera.position, camera.look_at = target + away, target
+def _fitter(camera: Camera) -> Callable[[viser.ClientHandle], Coroutine]:
+    """Return a function that fits the first view of a browser to its window."""
+
+    async def fit(client: viser.ClientHandle) -> None:
+        if client.camera.aspect < 1.0:
+            await asyncio.sleep(_SETTLE)
+            position, target = upright_view(camera, client.camera.aspect)
+            with client.atomic():
+                client.camera.position, client.camera.look_at = position, target
+
+    return fit
+
+
+def upright_view(camera: Camera, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and target of a camera for a window higher than wide, whose lower half shows the panel [m].
+
+    Args:
+        camera: of a window as wide as high.
+        aspect: width over height of the window.
+    """
+    target = np.array(camera.target)
+    away = 1.0 / max(aspect, 0.3) * (np.array(camera.position) - target)
+    half = float(np.linalg.norm(away)) * math.tan(math.radians(camera.field_of_view) / 2.0)
+    target = target - [0.0, 0.0, 0.5 * half]
+    return target + away, target
 
 
 def _stop(server: viser.ViserServer) -> None:

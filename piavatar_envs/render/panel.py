@@ -225,7 +225,7 @@ class Panel:
 
     def show_words(self, words: str) -> None:
         """Show a message above all controls; none for an empty one."""
-        self._words.content = f"> {words}" if words else ""
+        self._words.content = f"*{words}*" if words else ""
 
     def show_link(self, url: str, command: str) -> None:
         """Show the address and the command that open a saved scene."""

@@ -135,6 +135,11 @@ def test_the_pid_agent_begins_anew_under_torque_control(open_show):
     assert show._agent.act(0).any() and not values_of(show, "particles.failure").any()
 
 
+def test_an_agent_that_begins_under_another_control(open_show):
+    show = open_show(agent="clip:bow", control="torque")
+    assert show.host.config.control.mode == "pose" and "needs control='pose'" in show.words
+
+
 def test_settings_that_act_at_once(open_show):
     show = open_show()
     host, simulation = show.host, show.host.groups[0].simulation

@@ -19,7 +19,7 @@ import pytest
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.render import Arrow, Body, Camera, MovedSplats, Scene, Sphere
 from piavatar_envs.render.coloring import NUM_BANDS, bands_of, color_by
-from piavatar_envs.render.live import LiveView, _fit
+from piavatar_envs.render.live import LiveView, _fitter
 from tests.avatar.splat_clouds import on_body
 
 GREEN = (0.0, 1.0, 0.0)
@@ -238,20 +238,22 @@ def test_clicks_throw_while_the_pointer_does(view, body):
     np.testing.assert_allclose(direction, (0.0, 1.0, 0.0))
 
 
-def test_a_window_higher_than_wide_begins_farther_away():
+def test_a_window_higher_than_wide_begins_farther_away(monkeypatch):
+    monkeypatch.setattr("piavatar_envs.render.live._SETTLE", 0.0)
+
     class Client:
         def __init__(self, aspect):
-            self.camera = SimpleNamespace(aspect=aspect, position=(0.0, -4.0, 1.0), look_at=(0.0, 0.0, 1.0), fov=0.5)
+            self.camera = SimpleNamespace(aspect=aspect, position=None, look_at=None)
 
         def atomic(self):
             return contextlib.nullcontext()
 
     wide, narrow = Client(1.5), Client(0.5)
     for client in (wide, narrow):
-        asyncio.run(_fit(client))
-    assert wide.camera.position == (0.0, -4.0, 1.0)
-    np.testing.assert_allclose(narrow.camera.position - narrow.camera.look_at, (0.0, -9.6, 0.0), atol=1e-9)
-    assert narrow.camera.look_at[2] < 0.5
+        asyncio.run(_fitter(Camera((0.0, -4.0, 1.0), (0.0, 0.0, 1.0)))(client))
+    assert wide.camera.position is None
+    np.testing.assert_allclose(narrow.camera.position - narrow.camera.look_at, (0.0, -8.0, 0.0), atol=1e-9)
+    assert -0.5 < narrow.camera.look_at[2] < 0.5
 
 
 def port_of(view: LiveView) -> int:
