@@ -133,6 +133,19 @@ def short_ppo(algorithm: type) -> type:
     return ShortPPO
 
 
+def test_training_of_an_own_task_is_a_configuration(monkeypatch, tmp_path):
+    pytest.importorskip("stable_baselines3", reason="needs the extra train")
+    page = PAGES["docs/tasks.md"]
+    (settings,) = re.findall(r"^```yaml\n(env_id: .*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+    (tmp_path / "hands_up.yaml").write_text(settings, encoding="utf-8")
+    (tmp_path / "hands_up.py").write_text(next(block.code for block in blocks(page) if block.file), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    from agents.sb3.config import load_training
+
+    config = load_training(tmp_path / "hands_up.yaml", {})
+    assert config.env_id == "hands_up:Mine/HandsUp-v0" and config.total_steps % (8 * config.ppo.rollout_steps) == 0
+
+
 def check_refusals(block: str, space: dict) -> None:
     """Check that each line after ``>>>`` is refused in the words of the line below it."""
     lines = block.splitlines()
