@@ -19,10 +19,11 @@ from piavatar_envs.config import ConfigError, load_config
 
 Options = TypeVar("Options")
 
-#: Scripts by the folder of a configuration, and settings that no other script's configuration has.
-_FOLDERS = {"fit": "fit", "rsl_rl": "rsl_rl.train", "sb3": "sb3.train", "skrl": "skrl.train"}
+#: Scripts by the folder of a configuration, and settings that tell its configuration from others'.
+_FOLDERS = {"fit": "fit", "rllib": "rllib.train", "rsl_rl": "rsl_rl.train", "sb3": "sb3.train", "skrl": "skrl.train"}
 _SETTINGS = {
     "fit": {"parameters", "scorer"},
+    "rllib.train": {"iterations", "ppo", "env_runners"},
     "rsl_rl.train": {"iterations", "ppo"},
     "sb3.train": {"total_steps"},
     "skrl.train": {"mappo"},
@@ -91,6 +92,7 @@ def script_hint(path: Path, script: str) -> str:
     except (OSError, ValueError, yaml.YAMLError):
         return ""  # the error itself names the cause
     names = {str(key).partition(".")[0] for key in content} if isinstance(content, dict) else set()
-    others = [other for other, telling in _SETTINGS.items() if telling <= names]
+    known = {other: telling for other, telling in _SETTINGS.items() if telling <= names}
+    others = [other for other in known if not any(known[other] < more for more in known.values())]
     other = _FOLDERS.get(path.resolve().parent.name, others[0] if len(others) == 1 else script)
     return "" if other == script else f" (this is a file for python -m agents.{other})"

@@ -53,7 +53,7 @@ def test_options_that_there_are_not_are_refused(script, first, line, capsys):
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 #: The script that a folder of configurations belongs to.
-OWNERS = {"fit": "fit", "rsl_rl": "rsl_rl.train", "skrl": "skrl.train", "sb3": "sb3.train"}
+OWNERS = {"fit": "fit", "rllib": "rllib.train", "rsl_rl": "rsl_rl.train", "skrl": "skrl.train", "sb3": "sb3.train"}
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*/*.yaml")), ids=lambda path: path.stem)

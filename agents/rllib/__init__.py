@@ -1,0 +1,1 @@
+"""PPO by RLlib, on one machine or several."""
