@@ -15,8 +15,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from piavatar_envs.api.pettingzoo import AvatarParallelEnv
 from piavatar_envs.core.extras import MissingExtra, missing
-from piavatar_envs.multi import load_game
+from piavatar_envs.tasks.games import load_game_task
 
 try:
     from pettingzoo.utils import BaseParallelWrapper
@@ -61,7 +62,9 @@ def multi_agent_env(config: Mapping[str, Any]) -> Any:
     settings = dict(config)
     if "game" not in settings:
         raise ValueError('env_config names no game; give it one, as in env_config={"game": "sumo_v0"}')
-    return ParallelPettingZooEnv(JointTruncation(load_game(settings.pop("game")).parallel_env(**settings)))
+    name = settings.pop("game")
+    game = AvatarParallelEnv(load_game_task(name), name=name.rpartition(":")[2], **settings)
+    return ParallelPettingZooEnv(JointTruncation(game))
 
 
 def distinct_seeds(*, env_runner: Any, **_: Any) -> None:
