@@ -27,13 +27,13 @@ from agents.checkpoint import Checkpoint, as_arrays, check_finite, seed_all
 from agents.config import MOST_ENVS, Widths, multi_game
 from agents.evaluate import Agent
 from agents.files import write_atomically, write_config
+from agents.ranks import Ranks
 from agents.report import Curve
 from agents.rllib.envs import make_batch, make_game
 from agents.sb3.workers import components
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.api.rllib import distinct_seeds
 from piavatar_envs.config import FROZEN, ConfigError
-from piavatar_envs.core.extras import MissingExtra
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
 
@@ -173,14 +173,15 @@ def start_ray(config: RLlibTraining) -> None:
     """Join the cluster of ``RAY_ADDRESS``, or start Ray on this machine.
 
     Raises:
-        ConfigError: there is no such cluster.
-        ImportError: RLlib is not installed.
+        ConfigError: there is no such cluster, RLlib is not installed, or torchrun has started this process.
     """
+    if (size := Ranks.here().size) > 1:
+        raise ConfigError(f"torchrun has started {size} processes; start one, which has env_runners instead")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray
-    except ImportError as error:
-        raise MissingExtra('this script needs RLlib; install it with: pip install "ray[rllib]"') from error
+    except ImportError:
+        raise ConfigError('RLlib is not installed; install it with: pip install "ray[rllib]"') from None
     quiet = {"log_to_driver": False, "logging_level": "error", "ignore_reinit_error": True}
     if address := os.environ.get("RAY_ADDRESS"):
         try:
