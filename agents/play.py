@@ -349,7 +349,7 @@ def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], ever
                 pictures = halves.env_method("render")
                 # a half that has ended stands still until the other one has
                 shown = [pictures[i] if playing[i] else shown[i] for i in range(len(agents))]
-                texts = [f"{name}: {total:.0f}" for name, total in zip(agents, totals, strict=True)]
+                texts = [f"{name}: {round(float(total))}" for name, total in zip(agents, totals, strict=True)]
                 labelled = [label(picture, text) for picture, text in zip(shown, texts, strict=True)]
                 yield side_by_side(*labelled) if len(agents) == 2 else labelled[0]
             rows = [each_array(lambda own, i=i: own[i : i + 1], observation) for i in range(len(agents))]
