@@ -237,6 +237,7 @@ def garments(page: Page) -> None:
     """Append every quantity of garments, and its picture."""
     if _checked(page, "garments.json", "Garments"):
         page.picture(RESULTS / "garments.png", "Deviations over their tolerances")
+    _checked(page, "garments_mpm.json", "Garments as shells in MPM")
 
 
 def _checked(page: Page, name: str, heading: str) -> bool:
