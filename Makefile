@@ -8,7 +8,7 @@ EXTRAS := render,live,train,fit,motions,multi,props,skrl,rsl,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test test-lowest test-avatars test-vlm test-rllib test-live clients-light lint format docs clean
+.PHONY: help install demo test test-lowest test-avatars test-vlm test-rllib test-live clients-light clients lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
@@ -20,6 +20,7 @@ help:
 	@echo "make test-rllib  test the ids and games with Ray's RLlib, also on two nodes of which one is killed"
 	@echo "make test-live     drive the live view in a headless Chromium (CHROMIUM=/path/to/it, or that of Playwright)"
 	@echo "make clients-light  test the ids with CleanRL's wrappers, TorchRL, Tianshou, BenchMARL and SuperSuit"
+	@echo "make clients   test every client in tests/clients with its own pins, and write build/clients/clients.md (CLIENT='sbx minari' for some)"
 	@echo "make lint      check style, format and the types of the public API; 'make format' mends what can be mended"
 	@echo "make docs      write docs/envs/*.md from the code and build the site in build/site (PICTURES=1 draws the pages' pictures, too; CHECK=1 compares the pages only, LINKS=1 also visits the links to other sites)"
 	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
@@ -103,17 +104,13 @@ test-live: $(BROWSER)/.installed
 	test -n "$(CHROMIUM)" || command -v chromium || command -v chromium-browser || command -v google-chrome || PYTHONPATH=$(BROWSER) $(BIN)/python -m playwright install chromium
 	PYTHONPATH=$(BROWSER) CHROMIUM=$(CHROMIUM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/live/test_browser.py
 
-# Clients of other projects in a folder of their own, installed anew after their pins change. One process without a JIT, as
-# imports and compilation take longer than the tests.
-CLIENTS := $(VENV)/clients
-$(CLIENTS)/.installed: $(STAMP) tests/clients/requirements.txt
-	rm -rf $(CLIENTS)
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet --no-deps --target $(CLIENTS) --requirement tests/clients/requirements.txt
-	@touch $@
+# Clients of other projects, each in a folder of its own, installed anew after its pins change; the light ones share one.
+clients-light: install
+	$(BIN)/python -m scripts.clients light
+	PYTHONPATH=$(CURDIR)/$(VENV)/clients/light OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_docs.py -k torchrl
 
-clients-light: $(CLIENTS)/.installed
-	PYTHONPATH=$(CLIENTS) OMP_NUM_THREADS=1 NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest --durations 10 tests/clients
-	PYTHONPATH=$(CURDIR)/$(CLIENTS) OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_docs.py -k torchrl
+clients: install
+	$(BIN)/python -m scripts.clients $(CLIENT)
 
 lint: install
 	$(BIN)/ruff check .

@@ -19,14 +19,22 @@ from piavatar_envs.config import ConfigError, load_config
 
 Options = TypeVar("Options")
 
-#: Scripts by the folder of a configuration, and settings that tell its configuration from others'.
-_FOLDERS = {"fit": "fit", "rllib": "rllib.train", "rsl_rl": "rsl_rl.train", "sb3": "sb3.train", "skrl": "skrl.train"}
+#: Modules by the folder of a configuration, and settings that tell its configuration from others'.
+_FOLDERS = {
+    "fit": "agents.fit",
+    "rl_zoo3": "rl_zoo3.train",
+    "rllib": "agents.rllib.train",
+    "rsl_rl": "agents.rsl_rl.train",
+    "sb3": "agents.sb3.train",
+    "skrl": "agents.skrl.train",
+}
 _SETTINGS = {
-    "fit": {"parameters", "scorer"},
-    "rllib.train": {"iterations", "ppo", "env_runners"},
-    "rsl_rl.train": {"iterations", "ppo"},
-    "sb3.train": {"total_steps"},
-    "skrl.train": {"mappo"},
+    "agents.fit": {"parameters", "scorer"},
+    "agents.rllib.train": {"iterations", "ppo", "env_runners"},
+    "agents.rsl_rl.train": {"iterations", "ppo"},
+    "agents.sb3.train": {"total_steps"},
+    "agents.skrl.train": {"mappo"},
+    "rl_zoo3.train": {"PIAvatar/Reach-v0"},
 }
 
 _registry = ConstructorRegistry()
@@ -94,5 +102,6 @@ def script_hint(path: Path, script: str) -> str:
     names = {str(key).partition(".")[0] for key in content} if isinstance(content, dict) else set()
     known = {other: telling for other, telling in _SETTINGS.items() if telling <= names}
     others = [other for other in known if not any(known[other] < more for more in known.values())]
-    other = _FOLDERS.get(path.resolve().parent.name, others[0] if len(others) == 1 else script)
-    return "" if other == script else f" (this is a file for python -m agents.{other})"
+    asked = f"agents.{script}"
+    other = _FOLDERS.get(path.resolve().parent.name, others[0] if len(others) == 1 else asked)
+    return "" if other == asked else f" (this is a file for python -m {other})"

@@ -105,6 +105,8 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
     for module, target in (("ray", "test-rllib"), ("torchrl", "clients-light")):
         if any(re.search(rf"^(import|from) {module}\b", block.code, re.M) for block in page):
             pytest.importorskip(module, reason=f"needs {module}: make {target}")
+    if any("import minari" in block.code for block in page):
+        pytest.skip("needs a dataset: make clients CLIENT=minari")
     monkeypatch.chdir(tmp_path if name.startswith("docs/training/") else ROOT)
     for module in (sources, library):  # what a page registers ends with it
         monkeypatch.setattr(module, "_registered", dict(module._registered))

@@ -11,6 +11,7 @@ EXTRAS = {
     "render": ("imageio", "imageio_ffmpeg", "PIL"),
     "fit": ("optuna",),
     "vlm": ("transformers",),
+    "datasets": ("minari", "h5py", "torchrl"),
     "train": ("stable_baselines3", "torch", "matplotlib", "tensorboard"),
     "motions": ("pybullet_data",),
     "props": ("trimesh",),

@@ -1,0 +1,1 @@
+"""Offline data: episodes of expert, medium and random play as Minari datasets, and baselines that learn from them."""
