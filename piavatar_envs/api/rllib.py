@@ -58,7 +58,7 @@ def multi_agent_env(config: Mapping[str, Any]) -> Any:
     try:
         from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
     except ImportError as error:
-        raise MissingExtra('this view needs RLlib; install it with: pip install "ray[rllib]"') from error
+        raise MissingExtra("this view needs RLlib, the package ray[rllib]; docs/rllib.md has its versions") from error
     settings = dict(config)
     if "game" not in settings:
         raise ValueError('env_config names no game; give it one, as in env_config={"game": "sumo_v0"}')

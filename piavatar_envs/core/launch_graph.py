@@ -331,7 +331,7 @@ def _shown(loads: Sequence[Future]) -> Iterator[Future]:
 
 def _can_branch(device: wp.Device | None) -> bool:
     """Return whether captured graphs support conditions on the device."""
-    return wp.get_device(device).is_cpu or wp.is_conditional_graph_supported()
+    return (device is not None and device.is_cpu) or wp.is_conditional_graph_supported()
 
 
 def available_cores() -> int:
