@@ -81,7 +81,7 @@ $(VLM)/.installed: $(STAMP) tests/agents/requirements.txt
 	@touch $@
 
 test-vlm: $(VLM)/.installed
-	PYTHONPATH=$(VLM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/agents/test_fit_vlm.py
+	PYTHONPATH=$(VLM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --no-skips tests/agents/test_fit_vlm.py
 
 # RLlib with the Gymnasium that it pins, in a folder of their own, which its processes import from, too.
 RLLIB := $(VENV)/rllib
@@ -91,7 +91,7 @@ $(RLLIB)/.installed: $(STAMP) tests/rllib/requirements.txt
 	@touch $@
 
 test-rllib: $(RLLIB)/.installed
-	PYTHONPATH=$(CURDIR)/$(RLLIB):$(CURDIR) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/rllib tests/test_docs.py -k "rllib"
+	PYTHONPATH=$(CURDIR)/$(RLLIB):$(CURDIR) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --no-skips --durations 10 tests/rllib tests/test_docs.py -k "rllib"
 
 # Browser automation in a folder of its own. Playwright's Chromium is fetched where this machine has none.
 BROWSER := $(VENV)/browser
@@ -102,12 +102,12 @@ $(BROWSER)/.installed: $(STAMP) tests/live/requirements.txt
 
 test-live: $(BROWSER)/.installed
 	test -n "$(CHROMIUM)" || command -v chromium || command -v chromium-browser || command -v google-chrome || PYTHONPATH=$(BROWSER) $(BIN)/python -m playwright install chromium
-	PYTHONPATH=$(BROWSER) CHROMIUM=$(CHROMIUM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --durations 10 tests/live/test_browser.py
+	PYTHONPATH=$(BROWSER) CHROMIUM=$(CHROMIUM) OMP_NUM_THREADS=1 $(BIN)/python -m pytest --no-skips --durations 10 tests/live/test_browser.py
 
 # Clients of other projects, each in a folder of its own, installed anew after its pins change; the light ones share one.
 clients-light: install
 	$(BIN)/python -m scripts.clients light
-	PYTHONPATH=$(CURDIR)/$(VENV)/clients/light OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_docs.py -k torchrl
+	PYTHONPATH=$(CURDIR)/$(VENV)/clients/light OMP_NUM_THREADS=1 $(BIN)/python -m pytest --no-skips tests/test_docs.py -k torchrl
 
 clients: install
 	$(BIN)/python -m scripts.clients $(CLIENT)

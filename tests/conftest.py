@@ -41,6 +41,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default="cpu",
         help="Warp device to test on: cpu (default), cuda, cuda:1, ..., or gpu_on_cpu: GPU kernels on the CPU",
     )
+    parser.addoption(
+        "--no-skips", action="store_true", help="fail where a test is skipped, as all it needs is installed"
+    )
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail a run that skips what it was asked for."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if session.config.getoption("--no-skips") and reporter is not None and reporter.stats.get("skipped"):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @contextmanager
