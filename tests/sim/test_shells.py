@@ -9,24 +9,14 @@ from piavatar_envs.config import ClothConfig, ConfigError
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.sim.shells import bytes_of_shells, shell_matter
+from tests.sim.dressed import BALL, moved
 
 REACH, STAND = "PIAvatar/Reach-v0", "PIAvatar/Stand-v0"
 #: Meshes of few vertices, soft enough for few substeps.
 SOFT = {"stretch": 40.0}
 SKIRT = {"kind": "skirt", "length": 0.4, "edge": 0.07, **SOFT}
 WORN = {"garments": [SKIRT], "cloth": {"solver": "mpm"}}
-BALL = {"name": "ball", "shape": "sphere", "size": [0.12], "mass": 0.5, "position": [0.0, -0.75, 0.75]}
 EMPTY = {"gravity": 0.0, "scene": {"ground": False, "walls": False}}
-
-
-def moved(batch, steps: int, seed: int = 5, envs=None) -> dict[str, np.ndarray]:
-    """Step with random actions, of ``envs`` of the larger batch, and return the state."""
-    rng = np.random.default_rng(seed)
-    for _ in range(steps):
-        actions = rng.uniform(-1.0, 1.0, (2, *batch.action.shape[1:])).astype(np.float32)
-        batch.action.assign(actions[envs] if envs is not None else actions)
-        batch.step()
-    return batch.get_state()
 
 
 def test_a_reset_places_the_particles_where_the_drape_is(make_batch):
@@ -44,7 +34,7 @@ def test_a_reset_places_the_particles_where_the_drape_is(make_batch):
     cloth.record_places(graph)
     graph.run()  # the skin's bones placed held vertices, now the particles of the waist do
     assert np.abs(cloth.state.x.numpy() - x)[:, ~free].max() < 0.01
-    before = moved(batch, 3)
+    before = moved(batch, 3, of=2)
     batch.reset(np.array([False, True]))
     after = batch.get_state()
     np.testing.assert_array_equal(after["cloth.x"][0], before["cloth.x"][0])
@@ -98,11 +88,11 @@ def test_environments_of_a_batch_equal_single_ones(make_batch, equal):
     }
     several, single = make_batch(REACH, 2, **settings), make_batch(REACH, 1, **settings)
     several.reset(seeds=[4, 5])
-    found = moved(several, 5)
+    found = moved(several, 5, of=2)
     assert len(np.unique(found["cloth.stretch"][:, 0])) == 2 and not found["particles.failure"].any()
     for env in range(2):
         single.reset(seeds=[4 + env])
-        for name, value in moved(single, 5, envs=slice(env, env + 1)).items():
+        for name, value in moved(single, 5, envs=slice(env, env + 1), of=2).items():
             if name.startswith(("cloth", "particles", "randomize", "props")):
                 assert equal(found[name][env], value[0]), (name, env)
 
@@ -110,11 +100,11 @@ def test_environments_of_a_batch_equal_single_ones(make_batch, equal):
 def test_a_saved_state_goes_on_bit_for_bit(make_batch, equal):
     batch = make_batch(REACH, 2, **WORN)
     batch.reset(seeds=[1, 2])
-    saved = {name: value.copy() for name, value in moved(batch, 3).items()}
-    there = {name: value.copy() for name, value in moved(batch, 3, seed=7).items()}
+    saved = {name: value.copy() for name, value in moved(batch, 3, of=2).items()}
+    there = {name: value.copy() for name, value in moved(batch, 3, seed=7, of=2).items()}
     batch.reset(seeds=[7, 8])
     batch.set_state(saved)
-    for name, value in moved(batch, 3, seed=7).items():
+    for name, value in moved(batch, 3, seed=7, of=2).items():
         assert equal(value, there[name]), name
 
 

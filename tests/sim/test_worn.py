@@ -9,6 +9,7 @@ from piavatar_envs.api.conformance import check_task
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import FAILURE_CLOTH, failure_name
 from piavatar_envs.sim.garments import bytes_of_garments
+from tests.sim.dressed import BALL, moved
 
 REACH, STAND = "PIAvatar/Reach-v0", "PIAvatar/Stand-v0"
 #: A mesh of few vertices.
@@ -19,17 +20,6 @@ RANDOM = {
     "shape": {"randomize": True, "pool": 3},
     "randomize": {"cloth_mass_factor": [0.5, 2.0], "cloth_stiffness_factor": [0.8, 1.2]},
 }
-BALL = {"name": "ball", "shape": "sphere", "size": [0.12], "mass": 0.5, "position": [0.0, -0.75, 0.75]}
-
-
-def moved(batch, steps: int, seed: int = 5, envs=None) -> dict[str, np.ndarray]:
-    """Step with random actions, of ``envs`` of the larger batch, and return the state."""
-    rng = np.random.default_rng(seed)
-    for _ in range(steps):
-        actions = rng.uniform(-1.0, 1.0, (3, *batch.action.shape[1:])).astype(np.float32)
-        batch.action.assign(actions[envs] if envs is not None else actions)
-        batch.step()
-    return batch.get_state()
 
 
 def without_air(cloth) -> None:
