@@ -17,6 +17,13 @@ Resolved = TypeVar("Resolved", bound=BaseModel)
 
 #: Of the hidden layers of a network.
 Widths = tuple[Annotated[int, Field(ge=1)], ...]
+#: Hyper-parameters that several algorithms have, each with its own default.
+Discount = Annotated[float, Field(gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")]
+GaeLambda = Annotated[float, Field(ge=0.0, le=1.0, description="bias against variance of the advantage [-]")]
+ClipRange = Annotated[float, Field(gt=0.0, description="largest change of an action's probability ratio [-]")]
+ValueWeight = Annotated[float, Field(ge=0.0, description="weight of the critic's squared error [-]")]
+EntropyWeight = Annotated[float, Field(ge=0.0, description="weight of the entropy bonus [-]")]
+LogStd = Annotated[float, Field(ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")]
 #: Training episodes begin here; those of evaluations, which no agent was trained on, end before it.
 FIRST_TRAINED = 2**30
 #: Environments that one training can have: so many seeds are its own.

@@ -24,7 +24,17 @@ from pydantic import BaseModel, Field, model_validator
 
 from agents.batch_training import BatchTraining, Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, seed_all
-from agents.config import MOST_ENVS, Widths, multi_game
+from agents.config import (
+    MOST_ENVS,
+    ClipRange,
+    Discount,
+    EntropyWeight,
+    GaeLambda,
+    LogStd,
+    ValueWeight,
+    Widths,
+    multi_game,
+)
 from agents.evaluate import Agent
 from agents.files import write_atomically, write_config
 from agents.ranks import Ranks
@@ -57,13 +67,13 @@ class RLlibPPOSettings(BaseModel):
     epochs: int = Field(8, ge=1, description="passes over a rollout")
     minibatches: int = Field(4, ge=1, description="minibatches in a pass")
     learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's learning rate [-]")
-    discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
-    gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
-    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
-    value_weight: float = Field(1.0, ge=0.0, description="weight of the critic's squared error [-]")
-    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
+    discount: Discount = 0.9
+    gae_lambda: GaeLambda = 0.8
+    clip_range: ClipRange = 0.2
+    value_weight: ValueWeight = 1.0
+    entropy_weight: EntropyWeight = 0.0
     largest_gradient: float = Field(1.0, gt=0.0, description="norm to which gradients are clipped [-]")
-    log_std: float = Field(-0.5, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
+    log_std: LogStd = -0.5
     hidden: Widths = Field((128, 128), min_length=1, description="widths of the hidden layers of both networks")
 
 

@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from agents.batch_training import BatchTraining, load_batched
 from agents.checkpoint import load_weights, policy_mismatch, read_checkpoint
-from agents.config import Widths
+from agents.config import ClipRange, Discount, EntropyWeight, GaeLambda, ValueWeight, Widths
 from agents.evaluate import Agent, Seen
 from agents.files import CHECKPOINT
 from agents.rsl_rl.curriculum import AssistSchedule, MotionSchedule
@@ -65,17 +65,17 @@ class RslPPOSettings(BaseModel):
     final_kl: float | None = Field(
         None, gt=0.0, description="what desired_kl falls to by the last update, in even steps; null for no change [-]"
     )
-    discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    discount: Discount = 0.9
     reward_scale: float = Field(
         1.0,
         gt=0.0,
         description="factor on what the networks see of a reward [-]; the critic follows by clip_range a step, so "
         "discounted returns should be about 1",
     )
-    gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
-    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
-    value_weight: float = Field(1.0, ge=0.0, description="weight of the critic's squared error [-]")
-    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
+    gae_lambda: GaeLambda = 0.8
+    clip_range: ClipRange = 0.2
+    value_weight: ValueWeight = 1.0
+    entropy_weight: EntropyWeight = 0.0
     largest_gradient: float = Field(1.0, gt=0.0, description="norm to which gradients are clipped [-]")
     action_std: float = Field(0.6, gt=0.0, description="standard deviation of the first actions [-]")
     normalize_observation: bool = Field(False, description="whether networks see observations by running statistics")

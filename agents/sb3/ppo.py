@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.config import Widths, first_training_seed
+from agents.config import ClipRange, Discount, EntropyWeight, GaeLambda, LogStd, Widths, first_training_seed
 from agents.sb3.parallel import WAITING
 from piavatar_envs.config import FROZEN
 
@@ -40,14 +40,14 @@ class PPOSettings(BaseModel):
     final_learning_rate: float | None = Field(
         None, gt=0.0, description="what it falls to by the last update, evenly; null for a fixed one [-]"
     )
-    discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    discount: Discount = 0.9
     reward_scale: float = Field(
         1.0, gt=0.0, description="factor on what the networks see of a reward [-]; discounted returns should be about 1"
     )
-    gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
-    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
-    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
-    log_std: float = Field(-0.5, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
+    gae_lambda: GaeLambda = 0.8
+    clip_range: ClipRange = 0.2
+    entropy_weight: EntropyWeight = 0.0
+    log_std: LogStd = -0.5
     hidden: Widths = Field((128, 128), description="widths of the hidden layers of both networks")
 
 

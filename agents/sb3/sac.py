@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.config import Widths, first_training_seed
+from agents.config import Discount, Widths, first_training_seed
 from agents.sb3.ppo import networks
 from piavatar_envs.config import FROZEN
 
@@ -31,7 +31,7 @@ class SACSettings(BaseModel):
     train_every: int = Field(1, ge=1, description="steps a worker plays between two updates")
     minibatches: int = Field(1, ge=1, description="minibatches in an update")
     learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's learning rate [-]")
-    discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    discount: Discount = 0.9
     reward_scale: float = Field(
         1.0, gt=0.0, description="factor on what the networks see of a reward [-]; discounted returns should be about 1"
     )

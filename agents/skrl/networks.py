@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from skrl.memories.torch import RandomMemory
 from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 
-from agents.config import Widths
+from agents.config import ClipRange, Discount, EntropyWeight, GaeLambda, LogStd, ValueWeight, Widths
 from agents.ranks import ALONE, Ranks
 from piavatar_envs.config import FROZEN
 
@@ -26,13 +26,13 @@ class MAPPOSettings(BaseModel):
     epochs: int = Field(8, ge=1, description="passes over a rollout")
     minibatches: int = Field(4, ge=1, description="minibatches in a pass")
     learning_rate: float = Field(5.0e-4, gt=0.0, description="Adam's learning rate [-]")
-    discount: float = Field(0.95, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
-    gae_lambda: float = Field(0.9, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
-    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
-    value_weight: float = Field(0.5, ge=0.0, description="weight of the critic's squared error [-]")
-    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
+    discount: Discount = 0.95
+    gae_lambda: GaeLambda = 0.9
+    clip_range: ClipRange = 0.2
+    value_weight: ValueWeight = 0.5
+    entropy_weight: EntropyWeight = 0.0
     largest_gradient: float = Field(0.5, ge=0.0, description="norm to which gradients are clipped [-]; 0 for never")
-    log_std: float = Field(-0.7, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
+    log_std: LogStd = -0.7
     hidden: Widths = Field((128, 128), description="widths of the hidden layers of both networks")
 
 
