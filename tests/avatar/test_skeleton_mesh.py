@@ -11,8 +11,8 @@ from piavatar_envs.avatar.body.sampling import MIN_BONE_PARTICLES, ClosedSurface
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.skeleton_mesh import STEP, bone_of_name, nearest_bones, read_skeleton, thinned
 from piavatar_envs.avatar.body.sources import load_asset
+from scripts.gltf_files import Y_UP, rig_of
 from scripts.synthetic_smplx import TO_SMPL, synthetic_model
-from tests.avatar.gltf_files import Y_UP, rig_of
 from tests.avatar.test_rigs import named
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh, of the extra props, is not installed")

@@ -14,7 +14,7 @@ from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.body.splat_files import read_splats, write_ply
 from piavatar_envs.avatar.body.splats import SplatCloud, harmonics, turned_colors
 from piavatar_envs.core.extras import MissingExtra
-from tests.avatar.gltf_files import Y_UP, Writer
+from scripts.gltf_files import Y_UP, Writer
 from tests.avatar.splat_clouds import on_body
 
 FIELDS = ("means", "rotations", "scales", "opacities", "sh")

@@ -12,8 +12,9 @@ from piavatar_envs.avatar.body.character import body_of
 from piavatar_envs.avatar.body.sources import load_asset, mesh
 from piavatar_envs.avatar.body.sources.glb import read_character
 from piavatar_envs.avatar.body.textures import CLAMP, MIRROR, REPEAT, Texture, Textures, joined
-from tests.avatar.characters import dressed, in_t_pose
-from tests.avatar.gltf_files import rig_of
+from scripts.gltf_files import rig_of
+from scripts.synthetic_character import dressed
+from tests.avatar.characters import in_t_pose
 from tests.avatar.test_character import dressed_in_a_tube
 from tests.avatar.test_rigs import named
 

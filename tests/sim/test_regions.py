@@ -20,8 +20,8 @@ from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import ConfigError
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.materials import material_index
-from tests.avatar.characters import dressed
-from tests.avatar.gltf_files import rig_of
+from scripts.gltf_files import rig_of
+from scripts.synthetic_character import dressed
 
 STAND = "PIAvatar/Stand-v0"
 EMPTY = {"gravity": 0.0, "scene": {"ground": False, "walls": False}}

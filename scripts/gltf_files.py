@@ -1,4 +1,4 @@
-"""Small writer of glTF and GLB files, and characters for tests made from the embedded body."""
+"""Write small glTF and GLB files, and rigged bodies in the many ways in which files have them."""
 
 from __future__ import annotations
 
@@ -23,22 +23,33 @@ Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 @dataclass
 class Writer:
-    """A glTF document in the making."""
+    """A glTF document in the making, and its buffer."""
 
     document: dict[str, Any] = field(default_factory=lambda: {"asset": {"version": "2.0"}, "nodes": []})
     blob: bytearray = field(default_factory=bytearray)
 
     def add(self, key: str, item: dict[str, Any]) -> int:
+        """Append an item to a list of the document, and return its index."""
         self.document.setdefault(key, []).append(item)
         return len(self.document[key]) - 1
 
     def view(self, content: bytes, **more: Any) -> int:
+        """Append bytes to the buffer, and return the index of their view."""
         self.blob += b"\0" * (-len(self.blob) % 4)
         entry = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(content), **more}
         self.blob += content
         return self.add("bufferViews", entry)
 
     def accessor(self, array: np.ndarray, kind: str, stride: int = 0, sparse: bool = False, **more: Any) -> int:
+        """Append an array, and return the index of its accessor.
+
+        Args:
+            array: an element a row.
+            kind: of glTF, such as ``"VEC3"``.
+            stride: bytes from one element to the next, 0 for none between them.
+            sparse: whether every other element is in the sparse part.
+            **more: of the accessor.
+        """
         array = np.ascontiguousarray(array)
         entry = {"componentType": _CODES[array.dtype.str[1:]], "count": len(array), "type": kind, **more}
         rows = array.reshape(len(array), -1)
@@ -76,6 +87,7 @@ class Writer:
 
 
 def glb(document: bytes, blob: bytes) -> bytes:
+    """Return a GLB file of a document and its buffer."""
     document += b" " * (-len(document) % 4)
     blob += b"\0" * (-len(blob) % 4)
     head = struct.pack("<III", 0x46546C67, 2, 28 + len(document) + len(blob))
@@ -115,7 +127,7 @@ class Rig:
         weight_type: of the weights.
         material: of the skin.
         attributes: more of the skin, by name: array and accessor type.
-        parts: further meshes on the same bones, floats in a file of default axes and unit.
+        parts: further meshes on the same bones, floats in a file without an armature.
     """
 
     names: Sequence[str]
@@ -202,7 +214,7 @@ class Rig:
         for part in self.parts:
             bones, weights = top_weights(part.weights)
             attributes = {
-                "POSITION": out.accessor((part.vertices @ self.axes.T).astype("<f4"), "VEC3"),
+                "POSITION": out.accessor((self.unit * part.vertices @ self.axes.T).astype("<f4"), "VEC3"),
                 "JOINTS_0": out.accessor(bones.astype("<u1"), "VEC4"),
                 "WEIGHTS_0": out.accessor(weights.astype("<f4"), "VEC4"),
                 **{name: out.accessor(array, kind) for name, (array, kind) in part.attributes.items()},
