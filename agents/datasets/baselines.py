@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 from rich.console import Console
@@ -49,8 +49,10 @@ class Options:
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     #: JSON file for the figures
     out: Path | None = None
-    #: where to simulate and to learn
+    #: where to simulate
     device: str = "cpu"
+    #: where to learn, by default where to simulate: small networks learn as fast on a CPU
+    learn_device: Literal["cpu", "cuda"] | None = None
 
 
 def open_dataset(folder: Path, name: str) -> Any:
@@ -125,7 +127,8 @@ def main(args: list[str] | None = None) -> None:
         if unknown := set(options.learners) - LEARNERS.keys():
             raise ConfigError(f"learners={sorted(unknown)} must be some of {', '.join(LEARNERS)}")
         data = transitions(dataset)
-        learned = {name: learn(name, data, options.updates, options.seed, options.device) for name in options.learners}
+        where = options.learn_device or options.device
+        learned = {name: learn(name, data, options.updates, options.seed, where) for name in options.learners}
         word = options.dataset.rpartition("/")[2].rpartition("-v")[0]
         level = word if word in LEVELS else "expert"
         evaluations = score(dataset, level, learned, options)

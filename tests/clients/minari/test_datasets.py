@@ -53,7 +53,7 @@ def test_python_of_the_page_runs(folder, monkeypatch, capsys):
 
 def test_baselines_are_scored_in_the_same_episodes(folder, tmp_path, capsys):
     out = tmp_path / "scores.json"
-    options = ["--updates", "20", "--evaluation.episodes", "2", "--out", str(out)]
+    options = ["--updates", "20", "--evaluation.episodes", "2", "--learn-device", "cpu", "--out", str(out)]
     baselines.main([str(folder), "piavatar/reach/medium-v0", *options])
     said = capsys.readouterr().out
     written = json.loads(out.read_text())
