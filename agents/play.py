@@ -1,9 +1,9 @@
 """Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
 
-Takes the folder of a run with one agent, by ``agents.rsl_rl.train`` (policy.pt) or ``agents.sb3.train`` (policy.zip),
-builds the environment of its config.yaml, and plays the episodes of its evaluation. Of an interrupted training it
-takes the policy in the checkpoint. With ``--film`` or ``--export`` alone it plays no others; with ``--live`` it plays
-in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
+Takes the folder of a run with one agent, by ``agents.rsl_rl.train`` or ``agents.rllib.train`` (policy.pt), or by
+``agents.sb3.train`` (policy.zip), builds the environment of its config.yaml, and plays the episodes of its evaluation.
+Of an interrupted training it takes the policy in the checkpoint. With ``--film`` or ``--export`` alone it plays no
+others; with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
 
 A video of one agent, or of two in the same episodes side by side.
 """
@@ -78,7 +78,7 @@ def open_run(folder: Path, device: str = "cpu", imports: Collection[str] = ()) -
     """
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}; give the one that a training has left, as in runs/")
-    settings, kinds = folder / "config.yaml", {"policy.pt": _open_rsl, "policy.zip": _open_sb3}
+    settings, kinds = folder / "config.yaml", {"policy.pt": _open_torch, "policy.zip": _open_sb3}
     found = [folder / name for name in (*kinds, CHECKPOINT) if (folder / name).is_file()]
     if not settings.is_file() or not found:
         raise ConfigError(
@@ -94,10 +94,29 @@ def open_run(folder: Path, device: str = "cpu", imports: Collection[str] = ()) -
 
 def _open_interrupted(settings: Path, checkpoint: Path, device: str) -> Run:
     about = read_checkpoint(checkpoint)["about"]
-    kinds = {"rsl_rl.train": _open_rsl, "sb3.train": _open_sb3}
+    kinds = {"rsl_rl.train": _open_rsl, "rllib.train": _open_rllib, "sb3.train": _open_sb3}
     if about["script"] not in kinds:
         raise ConfigError(f"{checkpoint} is of agents.{about['script']}, which trains several agents; this plays one")
     return kinds[about["script"]](settings, checkpoint, device)
+
+
+def _open_torch(settings: Path, policy: Path, device: str) -> Run:
+    """Open the run of a ``policy.pt``, whose library its settings tell."""
+    return (_open_rllib if "env_runners" in read_yaml(settings) else _open_rsl)(settings, policy, device)
+
+
+def _open_rllib(settings: Path, policy: Path, _device: str) -> Run:
+    from agents.rllib.policy import load_agent, load_rllib
+
+    config = load_rllib(settings)
+    _check_single("/" in config.env_id, config.env_id, settings)
+    return Run(
+        config.env_id,
+        dict(config.env),
+        config.evaluation,
+        config.observe,
+        lambda layout, size: load_agent(policy, config, layout, size),
+    )
 
 
 def _open_rsl(settings: Path, policy: Path, device: str) -> Run:
@@ -117,8 +136,7 @@ def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
     from agents.sb3.policy import load_agent
 
     config = load_training(settings)
-    if config.is_multi:
-        raise ConfigError(f"{settings}: env_id={config.env_id!r} is a world of several agents; this plays one")
+    _check_single(not config.is_multi, config.env_id, settings)
     return Run(
         config.env_id,
         dict(config.env),
@@ -126,6 +144,11 @@ def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
         config.observe,
         lambda layout, size: for_all_seats(load_agent(policy, config, layout, size)),
     )
+
+
+def _check_single(single: bool, env_id: str, settings: Path) -> None:
+    if not single:
+        raise ConfigError(f"{settings}: env_id={env_id!r} is a world of several agents; this plays one")
 
 
 @dataclass(frozen=True)

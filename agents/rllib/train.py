@@ -16,103 +16,33 @@ import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, Field, model_validator
 
-from agents.batch_training import BatchTraining, Learned, iterations_of, run
+from agents.batch_training import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, seed_all
-from agents.config import (
-    MOST_ENVS,
-    ClipRange,
-    Discount,
-    EntropyWeight,
-    GaeLambda,
-    LogStd,
-    ValueWeight,
-    Widths,
-    multi_game,
-)
-from agents.evaluate import Agent
 from agents.files import write_atomically, write_config
 from agents.ranks import Ranks
 from agents.report import Curve
 from agents.rllib.envs import make_batch, make_game
+from agents.rllib.policy import RLlibTraining, actors, find_task, mean_agent
 from agents.sb3.workers import components
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.api.rllib import distinct_seeds
-from piavatar_envs.config import FROZEN, ConfigError
+from piavatar_envs.config import ConfigError
 from piavatar_envs.envs.task import Task
-from piavatar_envs.tasks import load_task
 
 if TYPE_CHECKING:
     from ray.rllib.algorithms import Algorithm, AlgorithmConfig
 
-#: RLlib's name of the policy where there is one avatar, and this script's where agents share one.
-SINGLE, SHARED = "default_policy", "shared"
+#: Name of the policy that agents share.
+SHARED = "shared"
 #: Memory of Ray's object store where this script starts it [bytes].
 _STORE = 200 * 2**20
 #: Seconds within which an env runner says that it is alive, and a lost one comes back, before an iteration goes on.
 _PROBE, _RESTORE = 10.0, 60.0
-
-
-class RLlibPPOSettings(BaseModel):
-    """Hyper-parameters of RLlib's PPO."""
-
-    model_config = FROZEN
-
-    rollout_steps: int = Field(32, ge=2, description="steps of every environment between two updates")
-    epochs: int = Field(8, ge=1, description="passes over a rollout")
-    minibatches: int = Field(4, ge=1, description="minibatches in a pass")
-    learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's learning rate [-]")
-    discount: Discount = 0.9
-    gae_lambda: GaeLambda = 0.8
-    clip_range: ClipRange = 0.2
-    value_weight: ValueWeight = 1.0
-    entropy_weight: EntropyWeight = 0.0
-    largest_gradient: float = Field(1.0, gt=0.0, description="norm to which gradients are clipped [-]")
-    log_std: LogStd = -0.5
-    hidden: Widths = Field((128, 128), min_length=1, description="widths of the hidden layers of both networks")
-
-
-class RLlibTraining(BatchTraining):
-    """Settings of a training with RLlib."""
-
-    env_id: str = Field("PIAvatar/Reach-v0", description="registered id, or a module of piavatar_envs.multi")
-    num_envs: int = Field(16, ge=1, le=MOST_ENVS, description="environments of every env runner")
-    env_runners: int = Field(
-        0, ge=0, le=1024, description="processes that play, each with a CPU; 0 to play in the training's own"
-    )
-    policies: Literal["shared", "independent"] = Field(
-        "shared", description="whether agents of a game share a policy or learn one each"
-    )
-    ppo: RLlibPPOSettings = Field(default_factory=RLlibPPOSettings, description="the algorithm")
-
-    @model_validator(mode="after")
-    def _check_seeds(self) -> RLlibTraining:
-        """Refuse more environments than a training has seeds."""
-        if self.total_envs > MOST_ENVS:
-            raise ConfigError(
-                f"env_runners={self.env_runners} with num_envs={self.num_envs} are {self.total_envs} environments, at "
-                f"most {MOST_ENVS} are possible; use fewer"
-            )
-        return self
-
-    @property
-    def total_envs(self) -> int:
-        """Return the number of environments of all env runners."""
-        return self.num_envs * max(self.env_runners, 1)
-
-
-def find_task(env_id: str) -> type[Task]:
-    """Return the task of an id or of a game.
-
-    Raises:
-        ValueError: there is no such task.
-    """
-    return load_task(env_id) if "/" in env_id else multi_game(env_id).TASK
 
 
 def algorithm_config(config: RLlibTraining, task: Task, device: str) -> AlgorithmConfig:
@@ -296,41 +226,6 @@ def first_weights(weights: Mapping[str, Mapping[str, Any]], log_std: float) -> d
     return begun
 
 
-def actors(weights: Mapping[str, Mapping[str, Any]]) -> dict[str, torch.nn.Sequential]:
-    """Build the networks of mean actions from the parameters of RLlib's default module, by policy."""
-    built = {}
-    for name, own in weights.items():
-        tensors = {key: torch.as_tensor(np.array(value)) for key, value in own.items()}
-        hidden = [key for key in tensors if key.startswith("encoder.actor_encoder.") and key.endswith(".weight")]
-        layers: list[torch.nn.Module] = []
-        for key in [*sorted(hidden, key=lambda key: int(key.split(".")[-2])), "pi.net.mlp.0.weight"]:
-            out, size = tensors[key].shape
-            layer = torch.nn.Linear(size, out)
-            layer.load_state_dict({"weight": tensors[key], "bias": tensors[key.removesuffix("weight") + "bias"]})
-            layers += [layer, torch.nn.Tanh()]
-        built[name] = torch.nn.Sequential(*layers[:-1])
-    return built
-
-
-def mean_agent(networks: Mapping[str, torch.nn.Module], task: Task, seen: list[int]) -> Agent:
-    """Return an agent of all mean actions, from observations ``(n, agents, size)`` to ``(n, agents, action_size)``.
-
-    Args:
-        networks: by policy.
-        task: of the environments.
-        seen: components of the flat observation that the networks see.
-    """
-    own = [networks[name] if name in networks else next(iter(networks.values())) for name in task.agent_names]
-
-    def act(observation: np.ndarray) -> np.ndarray:
-        shown = torch.as_tensor(observation[..., seen])
-        with torch.no_grad():
-            means = [network(shown[:, index]) for index, network in enumerate(own)]
-        return torch.stack(means, dim=1).clamp(-1.0, 1.0).numpy()  # RLlib clips what its policies do
-
-    return act
-
-
 def learn(config: RLlibTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
     """Train the policies.
 
@@ -358,7 +253,7 @@ def learn(config: RLlibTraining, task: Task, folder: Path, device: str, checkpoi
     states = {name: network.state_dict() for name, network in networks.items()}
     write_atomically(folder / "policy.pt", lambda file: torch.save(states, file))
     trainer.algorithm.stop()
-    return Learned(mean_agent(networks, task, seen), trainer.curve)
+    return Learned(mean_agent(networks, task.agent_names, seen), trainer.curve)
 
 
 def main(args: list[str] | None = None) -> None:

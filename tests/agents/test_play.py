@@ -14,9 +14,11 @@ torch = pytest.importorskip("torch", reason="needs the extra train")
 pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
 from agents import play, scores  # noqa: E402
+from agents.files import write_config  # noqa: E402
 from agents.play import open_run  # noqa: E402
+from agents.rllib.policy import actors, load_rllib  # noqa: E402
 from piavatar_envs.api.host import EpisodeHost  # noqa: E402
-from piavatar_envs.config import load_config  # noqa: E402
+from piavatar_envs.config import ConfigError, load_config  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 
 
@@ -132,6 +134,32 @@ def test_what_cannot_be_played_is_refused(options, words, run_of, device, monkey
         monkeypatch.setattr(play, builder, None)  # nothing is built
     with pytest.raises(SystemExit, match=f"error: .*{words}"):
         play.main([str(folder), *options, "--device", device])
+
+
+def test_a_policy_of_rllib_plays_without_it(tmp_path, device):
+    """Compare the actions with those of the weights as RLlib names them; a file of other sizes is refused."""
+    config = load_rllib({"env": {"fidelity": "tiny"}, "observe": ["target_position"], "ppo": {"hidden": [4]}})
+    batch = EpisodeHost(load_task(config.env_id)(load_config(load_task(config.env_id).Config, config.env)), 2, device)
+    rng = np.random.default_rng(0)
+    first, second = rng.normal(size=(4, 3)), rng.normal(size=(batch.action_size, 4))
+    weights = {
+        "encoder.actor_encoder.net.mlp.0.weight": first,
+        "encoder.actor_encoder.net.mlp.0.bias": np.ones(4),
+        "pi.net.mlp.0.weight": second,
+        "pi.net.mlp.0.bias": np.zeros(batch.action_size),
+        "pi.log_std": np.zeros(batch.action_size),
+    }
+    networks = actors({"default_policy": {name: value.astype(np.float32) for name, value in weights.items()}})
+    write_config(tmp_path, config)
+    torch.save({name: network.state_dict() for name, network in networks.items()}, tmp_path / "policy.pt")
+    batch.reset([0, 1])
+    seen = batch.observation()
+    run = open_run(tmp_path)
+    action = run.make_agent(batch.layout, batch.action_size)(seen)
+    hidden = np.tanh(seen[:, 0, batch.layout["target_position"].slice] @ first.T + 1.0)
+    np.testing.assert_allclose(action[:, 0], np.clip(hidden @ second.T, -1.0, 1.0), atol=1e-5)
+    with pytest.raises(ConfigError, match="policy.pt holds no policy of its config.yaml that sees 3 numbers"):
+        run.make_agent(batch.layout, batch.action_size + 1)
 
 
 def test_nothing_is_unpickled(run_of, device, tmp_path):

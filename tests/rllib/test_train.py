@@ -12,9 +12,11 @@ pytest.importorskip("ray", reason="needs RLlib: make test-rllib")
 torch = pytest.importorskip("torch", reason="needs the extra train")
 pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
+from agents import play  # noqa: E402
 from agents.batch_training import load_batched, new_task  # noqa: E402
 from agents.checkpoint import Checkpoint, read_checkpoint  # noqa: E402
 from agents.rllib import train  # noqa: E402
+from agents.rllib.policy import RLlibTraining, actors, find_task, mean_agent  # noqa: E402
 from piavatar_envs.config import ConfigError  # noqa: E402
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "rllib").glob("*.yaml"))
@@ -55,15 +57,31 @@ def test_published_configurations_train_go_on_and_leave_their_results(path, tmp_
     assert two > 0 and three == 1.5 * two
 
 
+def test_a_trained_policy_plays_as_in_training(tmp_path):
+    """Play what is left of a finished training, and of the same one as if it had been interrupted."""
+    reach, game = (next(path for path in CONFIGS if path.stem == name) for name in ("reach_rllib", "high_five_rllib"))
+    train.main([str(reach), *TINY, "iterations=1", "--out", str(tmp_path)])
+    then, out = json.loads((tmp_path / "results.json").read_text()), tmp_path / "evaluation.json"
+    for left in ("policy.pt", "checkpoint.pt"):
+        play.main([str(tmp_path), "--out", str(out)])
+        assert json.loads(out.read_text())["results"] == then["results"][2:]
+        (tmp_path / left).unlink()
+    train.main([str(game), *TINY, "iterations=1", "--out", str(tmp_path / "game")])
+    for left in ("policy.pt", "checkpoint.pt"):
+        with pytest.raises(SystemExit, match="high_five_v0.* is a world of several agents"):
+            play.main([str(tmp_path / "game")])
+        (tmp_path / "game" / left).unlink()
+
+
 def test_policies_are_those_of_rllib(tmp_path):
     """Compare the mean actions of the networks in policy.pt with those of RLlib's module."""
     settings = {"env": {"fidelity": "tiny"}, "observe": ["target_position"], "num_envs": 2, "iterations": 1}
-    config = load_batched(train.RLlibTraining, train.find_task, {**settings, "ppo": {"hidden": [8, 6]}})
-    task = new_task(config, train.find_task)
+    config = load_batched(RLlibTraining, find_task, {**settings, "ppo": {"hidden": [8, 6]}})
+    task = new_task(config, find_task)
     trainer = train.Trainer(config, task, tmp_path, "cpu", Checkpoint(tmp_path, "rllib.train", config, "cpu", False))
     weights = trainer.weights()
     assert (weights["default_policy"]["pi.log_std"] == config.ppo.log_std).all()
-    networks = train.actors(weights)
+    networks = actors(weights)
     observation = torch.randn(5, 3)
     module = trainer.algorithm.get_module("default_policy")
     with torch.no_grad():
@@ -76,11 +94,11 @@ def test_policies_are_those_of_rllib(tmp_path):
 
 
 def test_an_untrained_policy_of_several_agents_acts_for_each():
-    config = load_batched(train.RLlibTraining, train.find_task, {"env_id": "sumo_v0", "policies": "independent"})
-    task = new_task(config, train.find_task)
+    config = load_batched(RLlibTraining, find_task, {"env_id": "sumo_v0", "policies": "independent"})
+    task = new_task(config, find_task)
     networks = {name: torch.nn.Linear(2, 3) for name in task.agent_names}
     observation = np.random.default_rng(0).normal(size=(4, 2, 6)).astype(np.float32)
-    action = train.mean_agent(networks, task, [1, 4])(observation)
+    action = mean_agent(networks, task.agent_names, [1, 4])(observation)
     for index, name in enumerate(task.agent_names):
         own = networks[name](torch.as_tensor(observation[:, index][:, [1, 4]])).clamp(-1.0, 1.0)
         np.testing.assert_allclose(action[:, index], own.detach().numpy(), rtol=1e-6)
@@ -88,4 +106,4 @@ def test_an_untrained_policy_of_several_agents_acts_for_each():
 
 def test_more_environments_than_seeds_are_refused():
     with pytest.raises(ConfigError, match="env_runners=1024 with num_envs=128"):
-        load_batched(train.RLlibTraining, train.find_task, {"env_runners": 1024, "num_envs": 128})
+        load_batched(RLlibTraining, find_task, {"env_runners": 1024, "num_envs": 128})
