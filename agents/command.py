@@ -19,7 +19,7 @@ from piavatar_envs.config import ConfigError, load_config
 
 Options = TypeVar("Options")
 
-#: Modules by the folder of a configuration, and settings that tell its configuration from others'.
+#: Modules by the folder of a configuration, and settings that distinguish its configuration from others.
 _FOLDERS = {
     "fit": "agents.fit",
     "rl_zoo3": "rl_zoo3.train",

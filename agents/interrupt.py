@@ -1,4 +1,4 @@
-"""Ctrl-C in trainings: the first one ends a training where it can go on later, the second one at once."""
+"""Ctrl-C in trainings: the first one ends a training where it can be resumed, the second one at once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class StopRequest:
 
     Attributes:
         made: whether there was one in this process.
-        reached: what the training had had when it ended.
+        reached: how far the training had got when it ended.
     """
 
     def __init__(self, ranks: Ranks | None = None) -> None:
@@ -61,7 +61,7 @@ class StopRequest:
             signal.signal(signal.SIGINT, before)
 
     def obey(self, reached: str) -> None:
-        """End the training if there was a request; call it where nothing is lost, and on all ranks.
+        """End the training if there was a request; call it where no work is lost, and on all ranks.
 
         Args:
             reached: what the training has had.
@@ -94,7 +94,7 @@ def ended_by_interrupt(remedy: Callable[[], str], silent: bool = False) -> Itera
 
 
 def command(script: str, args: Sequence[str] | None, *more: str, ranks: Ranks | None = None) -> str:
-    """Return the command line of a script as it was given, with options that it lacks.
+    """Return the command line of a script as it was given, plus options that it lacks.
 
     Args:
         script: its name, without ``agents.``.

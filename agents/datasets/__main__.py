@@ -1,6 +1,6 @@
 """Record a dataset: ``python -m agents.datasets PIAvatar/Walk-v0 --level expert --episodes 256 --out runs/datasets``.
 
-Leaves a Minari dataset such as ``piavatar/walk/expert-v0`` below the folder; with that folder in the variable
+Writes a Minari dataset such as ``piavatar/walk/expert-v0`` below the folder; with that folder in the variable
 ``MINARI_DATASETS_PATH``, ``minari.load_dataset`` loads it by this name. Episodes are complete, and their seeds are
 those of trainings: evaluations play others.
 """
@@ -36,7 +36,7 @@ class Options:
     env_id: tyro.conf.Positional[str]
     #: settings of the environment: fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
-    #: how well it is played
+    #: level of play
     level: Literal["expert", "medium", "random"] = "expert"
     #: complete episodes
     episodes: int = 100

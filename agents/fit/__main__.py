@@ -1,6 +1,6 @@
 """Command line of studies: ``python -m agents.fit CONFIG.yaml [KEY=VALUE ...] [--out FOLDER]``.
 
-The same command goes on with a study that was interrupted or killed, and more ``trials`` prolong one.
+The same command continues a study that was interrupted or killed; with more ``trials``, it extends a finished one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Options:
 
     #: YAML file of the study, as in configs/fit
     config: tyro.conf.Positional[Path]
-    #: settings that win over the file's: trials=20, env.fidelity=tiny, scorers.vlm.path=FOLDER
+    #: settings that override the file's: trials=20, env.fidelity=tiny, scorers.vlm.path=FOLDER
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: folder of the study, by default runs/fit_ and the name of the file
     out: Path | None = None

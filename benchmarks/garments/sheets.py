@@ -36,7 +36,7 @@ def lattice(width: float, height: float, spacing: float) -> tuple[np.ndarray, np
     faces = []
     for a, b in pairwise(row):
         i = k = 0
-        while i < len(a) - 1 or k < len(b) - 1:  # on in the row whose next point is further left
+        while i < len(a) - 1 or k < len(b) - 1:  # advance in the row whose next point is further left
             if k == len(b) - 1 or (i < len(a) - 1 and points[a[i + 1], 0] <= points[b[k + 1], 0]):
                 faces.append([a[i], a[i + 1], b[k]])
                 i += 1
@@ -154,7 +154,7 @@ def surfaces(*pieces: tuple[np.ndarray, np.ndarray], num_envs: int = 1, device: 
 
 
 def move(o: Obstacles, points: np.ndarray) -> None:
-    """Let the obstacles go on to ``points``, ``(N, 3)`` or ``(num_envs, N, 3)``, in the next control step."""
+    """Let the obstacles move on to ``points``, ``(N, 3)`` or ``(num_envs, N, 3)``, in the next control step."""
     faces = o.faces.numpy().reshape(-1, 3)
     points = np.broadcast_to(points, (o.end.shape[0], *np.shape(points)[-2:]))
     wp.copy(o.start, o.end)
@@ -164,7 +164,7 @@ def move(o: Obstacles, points: np.ndarray) -> None:
 
 
 def booked(o: Obstacles, e: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the impulse on the obstacles since the books were cleared, and its moment about the origin; clear them."""
+    """Return the impulse on the obstacles since the sums were cleared, and its moment about the origin; clear them."""
     books = o.impulse.numpy()[e] * QUANTUM
     moment = books[:, 3:].sum(axis=0) + np.cross(o.end.numpy()[e].astype(float), books[:, :3]).sum(axis=0)
     o.impulse.zero_()

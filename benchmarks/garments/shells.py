@@ -86,7 +86,7 @@ class ShellRun:
         return getattr(self.cloth.state, name).numpy()[e].astype(float)
 
     def put(self, x: np.ndarray | None = None, v: np.ndarray | None = None) -> ShellRun:
-        """Put the vertices of all environments somewhere, triangles with them; they are at rest without ``v``."""
+        """Place the vertices of all environments, and triangles with them; without ``v`` they are at rest."""
         places = self.cloth.state.x
         if x is not None:
             places.assign(np.broadcast_to(x, (*places.shape, 3)).astype(np.float32))

@@ -36,14 +36,14 @@ FRAMES: dict[str, tuple[str, str, str]] = {
 }
 #: Bones without an end: the body at their joint, and the bone whose turn they share.
 ENDS = {"head": ("head", "neck"), "@_wrist": ("lunate_@", "@_elbow"), "@_foot": ("toes_@", "@_ankle")}
-SHORTEST = 0.03  # [m] bones below keep their direction
+SHORTEST = 0.03  # [m] shorter bones keep their direction
 
 
 def main(folder: tyro.conf.Positional[Path]) -> None:
     """Write a mesh for every body of the model.
 
     Args:
-        folder: made if it is not there.
+        folder: created if it does not exist.
     """
     import mujoco
     import musclemimic_models

@@ -114,7 +114,7 @@ def volumes(x: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def outside_range(probe: Measurements) -> float:
-    """Return by how much the joint that is furthest outside its range is there [deg]."""
+    """Return the distance of the joint that is furthest outside its range from that range [deg]."""
     lower, upper = joint_limits()
     moving = [not name.endswith(("pelvis", "foot")) for name in JOINT_NAMES]  # toes are locked, the pelvis has no range
     excess = np.maximum(probe.local - upper, lower - probe.local)[moving]
@@ -124,7 +124,7 @@ def outside_range(probe: Measurements) -> float:
 def policy(options: Options, folder: str, seconds: float = 3.0) -> Iterator[Quantity]:
     """Play a committed policy, and compare the trunk's volume with that at rest by tetrahedra between particles.
 
-    The deformation gradient of the particles does not see what skinning does; tetrahedra do.
+    The deformation gradient of the particles does not contain what skinning does to the volume; tetrahedra do.
     """
     from agents.evaluate import begin_round  # only this check needs the extra ``train``
     from agents.play import open_run

@@ -1,4 +1,4 @@
-"""One avatar in every environment of a batch: its body, what is commanded of it, and where it is tracked.
+"""One avatar in every environment of a batch: its body, its commands and its tracked bones.
 
 A reset places every particle at its skinned position, unstrained and at rest. A controller moves the avatar from there,
 see :mod:`piavatar_envs.avatar.controller`.
@@ -36,7 +36,7 @@ class Avatar:
         threads: threads that share the bones of a body.
         state: commands, and what holds the root.
         tracked: the bones as fitted to the particles.
-        placed: the pose of the last reset; only of environments that it has reset.
+        placed: the pose of the last reset; valid only for environments that were reset in it.
     """
 
     def __init__(self, points: BodyPoints, first: int, model: Model) -> None:
@@ -122,7 +122,7 @@ class Avatar:
 
         Args:
             graph: the launch graph to append to.
-            aim: kernel over ``(num_envs, bones)`` that moves the corrected rotations on to these.
+            aim: kernel over ``(num_envs, bones)`` that advances the corrected rotations to the end of the step.
             inputs: of that kernel.
         """
         if self._corrections.size == 0:

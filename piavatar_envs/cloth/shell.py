@@ -47,7 +47,7 @@ wp.set_module_options({"enable_backward": False})
 
 #: Share of a triangle's mass that its own particle carries; as much belongs to each corner.
 SHARE = 0.25
-#: Thickness that a sheet counts as in contact [grid spacings].
+#: Thickness of a sheet in contact [grid spacings].
 LAYER = 0.5
 #: Longest mean edge of a garment [grid spacings], beyond which nodes between its particles have no mass.
 LONGEST_EDGE = 2.0
@@ -98,8 +98,8 @@ class ShellMatter:
     def density(self, dx: float) -> np.ndarray:
         """Return the reference densities of the garments' velocity fields, shape ``(G,)`` [kg/m^3].
 
-        A sheet counts as a layer of half a grid spacing ``dx`` [m]: contact takes a field for the space that it fills,
-        and would stop thinner layers twice as far from a body.
+        A sheet counts as a layer of half a grid spacing ``dx`` [m]: contact locates the surface of a field
+        by the space that it fills, and would stop thinner layers twice as far from a body.
         """
         return self.areal_density / (LAYER * dx)
 
@@ -206,7 +206,7 @@ class Shell(Textile):
             state: likewise.
             scratch: likewise.
             first_particle: of the cloth.
-            settings: of which the wind acts; no wind if None.
+            settings: of cloth, of which only the wind has an effect; no wind if None.
             rows: 1 for the same lengths and fabrics in all environments, else ``num_envs``.
 
         Raises:
@@ -311,7 +311,7 @@ def check_edges(garments: Sequence[Garment], dx: float) -> None:
     """Check that no garment's edges are too long for a grid spacing ``dx`` [m].
 
     Raises:
-        ValueError: they are.
+        ValueError: edges are too long.
     """
     for garment in garments:
         mean = float(garment.mesh.length.mean())

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-#: Opcodes that are read; a real body model has some hundred.
+#: Most opcodes that are read; a real body model has several hundred.
 MAX_OPCODES = 100_000
-#: Nesting of arrays in arrays that is followed.
+#: Deepest nesting of arrays in arrays that is followed.
 MAX_DEPTH = 16
 _NUMPY = r"numpy\.(_?core\.(multiarray\.(_reconstruct|scalar)|numeric\._frombuffer)|ndarray|dtype)"
 _SPARSE = r"scipy\.sparse\.(_?(csc|csr|coo)\.)?(csc|csr|coo)_(matrix|array)"
@@ -37,7 +37,7 @@ _MARK = object()
 
 
 class Stub:
-    """An object of a pickle that is not made: its name, the arguments and the state that it would have been given."""
+    """Stand-in for an object that a pickle would create: its class name, arguments and state."""
 
     __slots__ = ("arguments", "name", "state")
 
@@ -164,7 +164,7 @@ def _pairs(items: list) -> dict:
 
 
 def plain(value: Any, depth: int = 0) -> Any:
-    """Return a value of :func:`read_pickle` as a NumPy array, a sparse matrix or what it is.
+    """Return a value of :func:`read_pickle` as a NumPy array or a sparse matrix, or unchanged.
 
     Raises:
         ValueError: a stub whose state has another layout, or sizes that differ from the file's bytes.

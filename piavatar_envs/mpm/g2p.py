@@ -204,7 +204,7 @@ def carried_velocity(
 ):
     """Return the kinematic velocity that carries a particle at ``x``, which must not enter colliders.
 
-    Contact acts on the nodes' kinematic velocity; what the particle's own ``vk`` has beyond it is projected.
+    Contact acts on the nodes' kinematic velocity; from the rest of the particle's own ``vk`` the approach is removed.
     ``kinematic`` is empty unless it is ``needed``, see :func:`needs_kinematic`.
     """
     if not needed:
@@ -226,8 +226,8 @@ def complete_advance(
 ):
     """Return ``s`` with deformation gradient, position and fault, for a move from ``x`` with ``advection``.
 
-    A particle moves at most a grid spacing, so that contact sees it before it has passed another body, and stays inside
-    the grid. Its velocity stays, and the way is cut along it, so that neither linear nor angular momentum changes. Its
+    A particle moves at most a grid spacing, so that contact acts before it has passed another body, and stays inside
+    the grid. Its velocity stays, and the path is cut along it, so that neither linear nor angular momentum changes. Its
     strain is limited in a substep, and its stretch to that at which the elastic wave would be too fast for the substep,
     where there is stress.
     """

@@ -57,8 +57,8 @@ class Mount:
 def mount_on(asset: AvatarAsset, camera: str) -> Mount:
     """Return the mount of a camera of :data:`BODY_CAMERAS`, by the mean shape of a body.
 
-    That of the head is before the face at half of its height, and looks where the face does, :data:`GAZE` down. That of
-    a hand is beyond the fingertips, and looks along the fingers; up is where the thumb is.
+    The head's camera is in front of the face, at half of its height, and looks ahead, :data:`GAZE` downwards.
+    A hand's camera is beyond the fingertips, and looks along the fingers; up is where the thumb is.
 
     Raises:
         ValueError: there is no such camera.
@@ -181,7 +181,7 @@ class BatchCamera:
         field_of_view: float | None = None,
         out: tuple[wp.array, wp.array] | None = None,
     ) -> None:
-        """Place nothing yet.
+        """Allocate the cameras; nothing is placed yet.
 
         Args:
             simulation: the simulated world.

@@ -45,7 +45,7 @@ _TAPS = wp.constant(
 _NUM_TAPS = wp.constant(9)
 #: Distances along the normal at which surfaces hide the sky, in voxels.
 _NEAR_REACH, _FAR_REACH = wp.constant(1.6), wp.constant(3.0)
-#: A flat surface sees some of itself in the blur: only what is above that hides the sky.
+#: Blurring makes a flat surface occlude itself by this much: only what exceeds it hides the sky.
 _FLAT_OCCLUSION = wp.constant(0.22)
 #: Averages with the neighbours, which hide the cells of the grids.
 _SMOOTHINGS = 3
@@ -260,7 +260,7 @@ class Lighting:
             vertices: of all pictures [m], shape ``(N, V)``.
             views: of all pictures, shape ``(N,)``.
             shadows: of the chunk, recorded before.
-            threads: returns the number of threads a picture.
+            threads: returns the number of threads per picture.
         """
         surfaces = self._surfaces
         count, k = len(drawn), threads(surfaces.num_vertices)

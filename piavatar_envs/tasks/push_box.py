@@ -262,7 +262,7 @@ class PushBoxTask(Task):
 
     summary = """A soft box stands in front of the avatar, turned at random by up to `box_turn`; its mass is drawn from
 `box_mass` and observed. Its target is a place on the floor at a `target_distance` from the box, within `target_angle`
-of straight ahead. The avatar moves as root actions say, at up to 1 m/s and 1.5 rad/s, its legs carried along; trunk and
+of straight ahead. Root actions move the avatar, at up to 1 m/s and 1.5 rad/s, its legs carried along; trunk and
 arms act. A good agent gets behind the box, bends over it, pushes it with hands and body in the right direction, and
 stops in time: the box slides on with friction `box_friction`. A blocked body also holds back the root command: before
 each action the command is clamped to within 0.1 m and 0.3 rad of the body."""

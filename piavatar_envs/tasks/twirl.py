@@ -158,9 +158,9 @@ class TwirlTask(Task):
     """Turn, faster or slower, such that the hem rises as high as wanted and stays there."""
 
     Config = TwirlConfig
-    description = "turn such that the hem of a skirt rises to a height that changes"
+    description = "turn so that the hem of a skirt rises to a changing height"
     observation_terms = (
-        ObservationTerm("wanted_lift", 1, "m", "world", "height over its place at rest to which the hem shall rise"),
+        ObservationTerm("wanted_lift", 1, "m", "world", "height over its place at rest to which the hem should rise"),
         ObservationTerm("lift", 1, "m", "world", "height of the hem over its place at rest, on average"),
         ObservationTerm("lift_rate", 1, "m/s", "world", "rate of that"),
         ObservationTerm("hem_spin", 1, "rad/s", "world", "angular speed of the hem about the vertical"),

@@ -178,7 +178,7 @@ class WalkTask(Task):
     """Walk straight ahead."""
 
     Config = WalkConfig
-    description = "walk straight ahead at a given speed by the strength of the joints"
+    description = "walk straight ahead at a given speed by joint torques alone"
     observation_terms = (
         *UPRIGHT_TERMS,
         ObservationTerm("path_direction", 3, "-", "root", "direction of the path: a unit vector"),
@@ -214,8 +214,9 @@ an avatar that falls behind a pace of 0.9 of the target by `max_lag` is out. The
 times the target; `lane` bounds it to either side. (With `control="pose"` nothing moves the pelvis: that is for poses,
 not for walking.)
 
-Feet are rewarded for bearing the body in turn and passing each other, by a clock that begins with the episode. It is
-observed as two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. With the clock,
+Feet are rewarded for bearing the body in turn and passing each other, in time with a clock that starts with the
+episode. It is observed as two numbers, `gait_phase`: its sine, positive while the left foot should bear the load, and
+its cosine. With the clock,
 arms that do not act hang and swing against the legs; under `control="pd"` so does the reference pose of action 0
 (upper arms 34 degrees lower than at rest, elbows stretched by 29, although actions reach only 20). With
 `gait.weight=0` there is no clock, and any way to get ahead counts, such as hopping on both feet."""

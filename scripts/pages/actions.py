@@ -51,8 +51,8 @@ def _of_targets(facts: Facts) -> str:
     return (
         "the rotation vector that its spring pulls to, relative to the parent bone. In the rest pose the axes are the "
         f"world's: the avatar faces -y, its left is +x. 0 is {_middle(facts)}, 1 and -1 are the ends of the range "
-        "below, and in between the target is proportional to the component. Springs have the greatest torques of "
-        "their joints as limits; only the ground and `root_assist` hold the body."
+        "below, and in between the target is proportional to the component. The torque of a spring is limited to the "
+        "greatest of its joint; only the ground and `root_assist` hold the body."
     )
 
 
@@ -80,7 +80,7 @@ def _under_torques(facts: Facts) -> str:
         f'With `control="pd"` or `"torque"` there are {size} components: neither the root nor the toes act. Under '
         f'`"pd"` a component is a target angle: 0 is {about}, 1 and -1 are the ends of the ranges above. Under '
         '`"torque"` it is a share of the greatest torque of the joint about that axis. Only the ground '
-        f"and `root_assist` hold the body then, no root is released, and {terms} are observed as well."
+        f"and `root_assist` hold the body then, there is no wrench to release, and {terms} are observed as well."
     )
 
 

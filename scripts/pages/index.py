@@ -18,8 +18,8 @@ def index_page(found: Sequence[tuple[Entry, Facts]]) -> str:
         [
             NOTE.format(source="the tasks"),
             "# Environments",
-            "A page has the actions, observations, reward, settings and `info` of one environment, as its code states "
-            "them. Units are metres, kilograms, seconds and radians; z is up.",
+            "Each page lists the actions, observations, reward, settings and `info` of one environment, from its "
+            "code. Units are metres, kilograms, seconds and radians; z is up.",
             "## One agent: Gymnasium" if multi else "",
             table(head, single),
             "## Several agents: PettingZoo" if multi else "",

@@ -16,7 +16,7 @@ def scene_section(scene: SceneConfig, avatars: Sequence[str]) -> str:
     rows = list(_rows(scene, avatars))
     if not rows:
         return ""
-    text = "Settings of `scene` for each kind (see below) that differ from the default or identify the thing."
+    text = "Settings of `scene` (listed below) that differ from their defaults, or that identify the object."
     return page(["## Scene", text, table(("kind", "name", "settings"), rows)])
 
 

@@ -53,10 +53,10 @@ def scores_section(entry: Entry, folder: Path) -> str:
     if not rows:
         return ""
     found = [_cells(score, folder) for _, score in rows]
-    head = ("agent", "control", "return", "success once, at the end, of the time", "episodes", "result, commit")
+    head = ("agent", "control", "return", "success: once, at the end, share of time", "episodes", "result, commit")
     text = (
         "All agents play complete episodes of the same seeds; the mean return of an episode has its 95 % interval. "
-        "Scores are of the commit that is named, and change with the bodies and the task. "
+        "Scores were measured at the commit that is named; they change with the bodies and the task. "
         "[Training](../training.md) says how the policies were made, and how to play those that are committed."
     )
     return page(["## Baseline scores", text, table(head, found)])

@@ -160,10 +160,10 @@ def _observations(facts: Facts) -> str:
 def _parameters(facts: Facts) -> str:
     others = " (the agent's own, then those of the others, counted on from it)" if facts.agents else ""
     text = (
-        "With `observe_parameters=True` the observation ends with the term `parameters`, all that the episode has "
-        "drawn, each from its range to [-1, 1]: the factors of `randomize` and the parameters of random shapes"
-        f"{others}, then what the task draws, and last `clock`, the share of the episode that is over. With "
-        '`control="pd"` or `"torque"` each avatar\'s own end with `root_assist`, as it is now.'
+        "With `observe_parameters=True` the observation ends with the term `parameters`: all that the episode has "
+        "drawn, each mapped from its range to [-1, 1]. It has the factors of `randomize` and the parameters of random "
+        f"shapes{others}, then what the task draws, and last `clock`, the share of the episode that is over. With "
+        '`control="pd"` or `"torque"` the parameters of each avatar end with its present `root_assist`.'
     )
     parameters = [p for p in facts.task.drawn() if p.low < p.high]
     rows = [
@@ -205,7 +205,7 @@ def _episode(entry: Entry, facts: Facts) -> str:
     failures = ", ".join(f"{bit} {code(name)} ({FAILURE_DOCS[name]})" for bit, name in FAILURE_NAMES.items())
     ends.append(
         f'the simulation fails; `info["failure"]` is the sum of its causes: {failures}; '
-        "`piavatar_envs.failure_name` spells it"
+        "`piavatar_envs.failure_name` decodes it"
     )
     return page(
         [
@@ -247,7 +247,7 @@ def _arguments(entry: Entry, facts: Facts) -> str:
         f'{code(maker)} takes `render_mode` (`None`, `"rgb_array"`, or `"human"`: live in a web browser), `device` (of '
         'Warp: `"cpu"` or `"cuda:0"`), '
         f"{more}`config` (a mapping or a YAML file, where `None` is `null`) and, by keyword, every setting below. Its "
-        'last name is enough, as in `tone=0.3`; the whole name is given as `**{"control.tone": 0.3}`. The unit `-` is '
+        'last part is enough, as in `tone=0.3`; the whole name is given as `**{"control.tone": 0.3}`. The unit `-` is '
         "that of a pure number."
     )
     return page(

@@ -132,7 +132,7 @@ def test_bodies_know_nothing_of_each_other_and_rounds_begin_anew(standing):
         standing.action.assign(action.astype(np.float32)[:, None])
         standing.step()
     first = PIDAgent(standing)(seen[0])
-    assert np.abs(many(seen[0]) - first).max() > 1e-3  # it remembers
+    assert np.abs(many(seen[0]) - first).max() > 1e-3  # it is stateful
     many.begin(len(SEEDS))
     np.testing.assert_array_equal(many(seen[0]), first)
 

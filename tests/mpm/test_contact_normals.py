@@ -137,7 +137,7 @@ def test_gap_of_flat_faces(meet, gap, density):
 
 @pytest.mark.parametrize(("friction", "pull"), [(0.0, 3.0), (0.2, 4.0)])
 def test_a_block_slides_on_a_table(meet, friction, pull):
-    # Pulled along x [m/s^2]. With normals of single nodes its front edge ploughs, like another friction of 0.15.
+    # Pulled along x [m/s^2]. With normals of single nodes its front edge ploughs, like an additional friction of 0.15.
     plane = {"planes": [((0.0, 0.0, 1.0), -0.15, 5.0)], "gravity": (0.0, 0.0, -9.81), "control_dt": 0.01}
     sim = meet([{"box": BLOCK}, {"box": TABLE}], friction=friction, stiffness=200.0, pushed=True, **plane)
     sim.push(damping=40.0).run(20)
@@ -151,7 +151,7 @@ def test_a_block_slides_on_a_table(meet, friction, pull):
 
 
 def test_a_block_rests_on_a_table(meet):
-    # Pulled with less than friction holds, it does not creep.
+    # Pulled with less than friction can hold, it does not creep.
     plane = {"planes": [((0.0, 0.0, 1.0), -0.15, 5.0)], "gravity": (0.0, 0.0, -9.81), "control_dt": 0.01}
     sim = meet([{"box": BLOCK}, {"box": TABLE}], friction=0.5, stiffness=200.0, pushed=True, **plane)
     sim.push(damping=40.0).run(20)

@@ -64,7 +64,7 @@ def test_train_all_continues_shorter_trainings_and_refuses_other_settings(stem, 
     assert not job.is_over((f"{length}=201",)) and not job.is_over((f"{length}=200", "evaluation.episodes=3"))
     with pytest.raises(ValueError, match=r"ppo\.epochs=\d+.*77.*--runs"):
         train_all.main((f"walk_{stem[-3:]}", stem), ("ppo.epochs=77", f"{length}=200"), seeds=1, runs=tmp_path)
-    assert [folder.name for folder in tmp_path.iterdir()] == [job.folder.name]  # nothing was begun
+    assert [folder.name for folder in tmp_path.iterdir()] == [job.folder.name]  # no training was started
     results.write_text("{}")
     with pytest.raises(ValueError, match=r"results\.json"):
         job.is_over(())

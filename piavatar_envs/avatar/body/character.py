@@ -1,4 +1,4 @@
-"""Characters as files have them, and the bodies that they become.
+"""Characters as read from files, and the bodies that they become.
 
 A :class:`Character` is a skinned soup of surfaces in the rest pose of its file. :func:`body_of` poses it as the body of
 this package rests, closes its skin, and keeps its own surfaces as the look of the body.
@@ -341,7 +341,7 @@ def _check(character: Character) -> None:
     """Refuse arrays that do not fit together, and a body that is no person's size.
 
     Raises:
-        ValueError: they are such.
+        ValueError: arrays do not fit together, or no person has that size.
     """
     count = len(character.vertices)
     shapes: Sequence[tuple[str, np.ndarray, tuple[int, ...]]] = (

@@ -1,4 +1,4 @@
-"""Flesh: its softness, by which it is late for commanded motion and jiggles, and how firmly it is held by bones.
+"""Flesh: its softness, by which it lags behind commanded motion and jiggles, and how firmly bones hold it.
 
 Soft flesh misses a share ``amount * softness`` of every *change* of the kinematic velocity; what it misses becomes
 physical velocity, which strains the flesh, drags on the bones and swings back. (Attenuating the kinematic velocity
@@ -18,8 +18,8 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 #: Distance from the nearest bone particle at which flesh is fully soft [m].
 FULL_DEPTH = 0.10
 SOFT_JOINTS = ("pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip")
-#: Bones of these fill their flesh: a foot must bear the body. As soft as the rest, it turns about its bones by 1 rad
-#: under some 70 N m, an eighth of what standing takes.
+#: Bones of these fill their flesh: a foot must bear the body. If it were as soft as the rest, it would turn about its
+#: bones by 1 rad under some 70 N m, an eighth of what standing takes.
 FIRM_JOINTS = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 
 
@@ -66,10 +66,10 @@ def firmness(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
 
 
 def weight_loads(mass: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Return what weight and support accelerate particles by, over gravity, if bones bear their flesh; ``(P,)``.
+    """Return the accelerations of particles by weight and support, over gravity, if bones bear their flesh; ``(P,)``.
 
     Flesh has its weight. The support of each bone's whole mass acts on the bone particles of that mass, and on the
-    flesh of :data:`FIRM_JOINTS`, so that the loads of a bone add up to nothing.
+    flesh of :data:`FIRM_JOINTS`, so that the loads of a bone add up to zero.
 
     Args:
         mass: of particles [kg], shape ``(P,)``.
@@ -95,7 +95,7 @@ def attachment_rates(
     Args:
         depth: of particles below the skin [m], shape ``(P,)``.
         bone_distance: from the nearest bone particle [m], shape ``(P,)``.
-        firm: share that is held as bone all through, shape ``(P,)``.
+        firm: share that is held as firmly as bone throughout, shape ``(P,)``.
         skin: rate at the skin [1/s]; 0 for no pull at all.
         core: rate at the bone [1/s].
     """

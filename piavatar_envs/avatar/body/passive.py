@@ -5,7 +5,7 @@ Towards the end of a range the moment grows exponentially with the component ``s
     m(s) = M (exp(r (s - end)) - exp(-r end))   for s > 0,
 
 nothing at rest and nearly ``M`` at the end of the range. Muscles that span two joints couple them: their ``s`` is a sum
-over both. All are gradients of energies, so that passive joints give back what they take, but for their damping.
+over both. All are gradients of energies, so that passive joints give back what they take, except for their damping.
 
 - hip, knee and ankle about x: Riener & Edrich, "Identification of passive elastic joint moments in the lower
   extremities", J. Biomech. 32 (1999), pp. 539-544, ten healthy subjects. Of their exponentials these are taken: hip
@@ -13,7 +13,7 @@ over both. All are gradients of energies, so that passive joints give back what 
   exp(-3.971 + 0.0495 k - 0.0128 h), calf exp(2.102 + 0.0843 d - 0.0176 k), toe down exp(-7.976 + 0.1949 p) [N m], with
   the angles of hip flexion ``h = -e``, knee flexion ``k``, ankle dorsiflexion ``d = -p`` in degrees. Their fits of two
   joints that a muscle spans agree with one energy: the hamstrings' ratio is 0.74 from the hip, 0.71 from the knee. The
-  coefficients are as an implementation for sprinting models has them, the article itself was not at hand.
+  coefficients are those of an implementation for sprinting models; the article itself was not at hand.
 - trunk, as measured in living people and collected by Watt, Callaway & Williams, "In vivo through-range passive
   stiffness of the lumbar spine", Med. Biol. Eng. Comput. 60 (2022): flexion 0.0, 0.1 and 0.7 N m per percent of the
   range in its low, transition and high zones (Beach et al.); lateral bending 0.25, 0.6, 1.7 and 5.1 N m per degree in

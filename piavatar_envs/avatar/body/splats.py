@@ -1,4 +1,4 @@
-"""Clouds of Gaussian splats (NumPy): what is static about an avatar that is drawn as such.
+"""Clouds of Gaussian splats (NumPy): the static data of an avatar that is drawn as splats.
 
 A splat is a Gaussian density with an opacity and a colour that depends on the direction in which it is seen (Kerbl et
 al., "3D Gaussian splatting for real-time radiance field rendering", ACM Trans. Graph. 42 (2023)). The colour is
@@ -93,7 +93,7 @@ class SplatCloud:
     def deformed(
         cloud: SplatCloud, means: np.ndarray, covariances: np.ndarray, turns: np.ndarray | None = None
     ) -> SplatCloud:
-        """Return a cloud in other places.
+        """Return a cloud with other centres and covariances.
 
         Args:
             cloud: gives opacities and colours.
@@ -198,8 +198,8 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
 def turned_colors(sh: np.ndarray, turns: np.ndarray) -> np.ndarray:
     """Return coefficients of colours that turn with their splats, shape ``(S, K, 3)``.
 
-    The harmonics of a degree turn among themselves. Their matrix follows from as many directions ``D`` as there are of
-    them: ``Y(D) c' = Y(D R) c`` with the turned directions ``R^T d`` in the rows of ``D R``.
+    The harmonics of a degree turn among themselves. Their matrix follows from as many directions ``D`` as there are
+    harmonics: ``Y(D) c' = Y(D R) c`` with the turned directions ``R^T d`` in the rows of ``D R``.
 
     Args:
         sh: coefficients, shape ``(S, K, 3)``.

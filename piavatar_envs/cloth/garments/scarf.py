@@ -16,10 +16,11 @@ from piavatar_envs.cloth.wearer import Wearer
 
 #: Distance from the skin at which a scarf is laid, and its thickness [m].
 _EASE, THICKNESS = 0.012, 0.006
-#: Length of a scarf without one over the wearer's height, and half the size of what is held at the nape [m].
+#: Default length over the wearer's height, and half the size of the part that is held at the nape [m].
 _LENGTH, _HELD = 0.95, 0.03
-#: Place of its middle line beside the neck over that of the shoulder's joint; way from the neck to where it falls, and
-#: width of what is measured, both over the wearer's height; and shift outwards over its width.
+#: Distance of the middle line from the neck, over that of the shoulder joint; distance from the neck at which the scarf
+#: begins to hang, and half width of the skin that is measured, both over the wearer's height; shift outwards over the
+#: scarf's width.
 _BESIDE, _CHEST, _NEAR, _SHIFT = 0.5, 0.09, 0.02, 0.1
 _SAMPLES = 600
 
@@ -114,7 +115,7 @@ def _farthest(wearer: Wearer, place: tuple[float, float], axes: tuple[int, int],
     Args:
         wearer: the body.
         place: coordinates on two axes [m].
-        axes: those.
+        axes: indices of these two axes.
         direction: the third axis; -1 for against y.
         size: of the wearer [m].
     """

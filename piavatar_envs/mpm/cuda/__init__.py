@@ -1,1 +1,1 @@
-"""P2G and G2P paths for GPUs: tiles of particles for large bodies, a block per environment for small ones."""
+"""P2G and G2P paths for GPUs: ``tiled_*`` for large bodies, ``block_*`` (a block per environment) for small ones."""

@@ -84,8 +84,8 @@ class UprightConfig(BaseModel):
     model_config = FROZEN
 
     stand_head: float = Field(0.85, gt=0.0, le=1.0, description="head height that counts as standing, a share [-]")
-    height_margin: Margin = Field(0.25, description="missing height at which a reward is a tenth, likewise [-]")
-    tilt_margin: Margin = Field(0.6, description="tilt at which it is, likewise [rad]")
+    height_margin: Margin = Field(0.25, description="share of height lost at which a reward is a tenth [-]")
+    tilt_margin: Margin = Field(0.6, description="tilt at which a reward is a tenth [rad]")
 
 
 class StillConfig(BaseModel):
@@ -94,7 +94,7 @@ class StillConfig(BaseModel):
     model_config = FROZEN
 
     speed_margin: Margin = Field(1.0, description="speed at which a reward is a tenth [m/s]")
-    pose_margin: Margin = Field(0.4, description="mean joint angle at which it is, likewise [rad]")
+    pose_margin: Margin = Field(0.4, description="mean joint angle at which a reward is a tenth [rad]")
 
 
 @wp.struct

@@ -233,7 +233,7 @@ class BoxingTask(RingTask):
 
     summary = """`num_agents` avatars stand on guard, `start_distance` apart around the centre of a square ring of
 `ring_size`, each displaced by up to `place_noise`; smooth walls stand in for the ropes. The trunk, the arms and the
-root act. A blow is an impulse on the other's head or trunk, in one control step, that the striking arms have felt as
+root act. A blow is an impulse on the other's head or trunk, in one control step, that acts on the striking arms as
 well. It is worth nothing up to `blow_impulse`, and `head_points` or `torso_points` from twice that on. A contact counts
 once, by its strongest step, and is over when the impulse has fallen below half of `blow_impulse`: leaning scores
 nothing more. An agent that is knocked down is out, and its body stays where it fell; the last one on its feet wins.
