@@ -58,7 +58,7 @@ class Job:
         """Return whether the training is complete; its scores are the last file that it writes.
 
         Args:
-            settings: that win over the file's.
+            settings: that override the file's.
 
         Raises:
             ValueError: the scores in its folder are of something else; or a setting is refused.
@@ -117,7 +117,7 @@ def end(process: subprocess.Popen) -> None:
 
 def main(
     configs: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
-    settings: Annotated[tuple[str, ...], tyro.conf.arg(help="settings that win over the files': iterations=10")] = (),
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(help="settings that override the files': iterations=10")] = (),
     seeds: Annotated[int, tyro.conf.arg(help="trainings of each configuration")] = 5,
     gpus: Annotated[tuple[str, ...], tyro.conf.arg(help="numbers of the GPUs to train on; none for the CPU")] = (),
     jobs_per_device: Annotated[int, tyro.conf.arg(help="trainings at a time on a GPU, or on the CPU")] = 3,

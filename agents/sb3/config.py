@@ -70,7 +70,7 @@ def load_training(
 
     Args:
         source: a YAML file or a mapping.
-        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
+        overrides: settings that override it, as from a command line; ``env.NAME`` for those of the environment.
 
     Raises:
         ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.

@@ -63,7 +63,7 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
             config: settings as a mapping, a YAML file or a configuration.
             max_cycles: control steps until truncation; wins over ``episode_seconds``.
             name: of the environment in its ``metadata``; that of the task's module if not given.
-            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+            **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.

@@ -88,7 +88,7 @@ def load_config(
     Args:
         cls: the model, e.g. a task's configuration.
         source: nothing, a mapping, the path of a YAML file, or a configuration to start from.
-        overrides: settings that win over ``source``; nested, dotted, or bare where the name is unique.
+        overrides: settings that override ``source``; nested, dotted, or bare where the name is unique.
 
     Raises:
         ConfigError: the settings are no mapping, or have an unknown key, a wrong type or a value out of range; one line
