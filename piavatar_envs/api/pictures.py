@@ -125,7 +125,7 @@ class SceneReader:
         for number, part in enumerate(self.stage.parts):
             own = vertices[part.vertices]
             if part.kind == "garment":
-                garments.append(Body(own, part.faces, part.color, part.colors))
+                garments.append(Body(own, part.faces, part.color, part.colors, textures=part.textures))
             elif part.kind in ("avatar", "prop"):
                 splats = self._splats(len(bodies))
                 body = Body(own, part.faces, part.color, part.colors, splats=splats, textures=part.textures)

@@ -27,6 +27,8 @@ class Cut:
         fit: positions of the same vertices on another shape of the same body; None binds them to the nearest skin.
         thickness: distance at which it lies on the skin [m].
         colors: sRGB of the vertices, shape ``(V, 3)`` uint8; None for those of the fabric.
+        source: places of the vertices on the surface of a file that this is, shape ``(V, 3)`` [m]; None for a kind that
+            is cut.
         replaces: name of the surface of the wearer's file that is no longer drawn, empty for none.
     """
 
@@ -38,6 +40,7 @@ class Cut:
     fit: Callable[[Wearer], np.ndarray] | None = None
     thickness: float = THICKNESS
     colors: np.ndarray | None = None
+    source: np.ndarray | None = None
     replaces: str = ""
 
     def measure(self, pairs: np.ndarray) -> np.ndarray:

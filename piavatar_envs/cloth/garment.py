@@ -58,6 +58,8 @@ class Garment:
         skin_weights: their weights, shape ``(V, 4)``.
         shape_deltas: change of ``draped`` by the shape parameters [m], shape ``(2 S, V, 3)``; None without grading.
         colors: sRGB of the vertices, shape ``(V, 3)`` uint8; None for those of the fabric.
+        source: places of the vertices on the surface of the wearer's file that it replaces, in the mean shape [m],
+            shape ``(V, 3)``; None where that surface's textures are not drawn.
         replaces: name of the surface of the wearer's file that is not drawn, because this is it; empty for none.
     """
 
@@ -73,4 +75,5 @@ class Garment:
     skin_weights: np.ndarray | None = None
     shape_deltas: np.ndarray | None = None
     colors: np.ndarray | None = None
+    source: np.ndarray | None = None
     replaces: str = ""

@@ -26,6 +26,9 @@ _FEWEST = 12
 #: Number of vertices over that of the wanted edges, from which triangles are meshed anew.
 _TOO_FINE = 1.3
 
+#: Number and length [m] of the steps in which a held border is led out of the skin, and passes over its edges in each.
+_LED_STEPS, _LED, _EVENING = 60, 0.003, 8
+
 #: Settings of the kinds that are made from triangles.
 Holding = Annotated[
     Literal["top", "none"], Field(description="what the body holds: the border that is highest, or nothing")
@@ -83,7 +86,33 @@ def sheet_of(wearer: Wearer, name: str, points: np.ndarray, faces: np.ndarray, h
     def lengths(pairs: np.ndarray) -> np.ndarray:
         return np.linalg.norm(shape[pairs[:, 0]] - shape[pairs[:, 1]], axis=1)
 
-    return Cut(wearer.outside(points, THICKNESS), faces, sees, top, lengths, None, THICKNESS)
+    points = wearer.outside(points, THICKNESS)
+    if len(top):
+        points[top] = _led_out(wearer, shape[top])
+    return Cut(points, faces, sees, top, lengths, None, THICKNESS, source=shape)
+
+
+def _led_out(wearer: Wearer, loop: np.ndarray) -> np.ndarray:
+    """Return a closed border moved out of the skin in small steps, in which its stretch evens out along it.
+
+    Vertices that each take their nearest way out crowd on ridges of the body and leave gaps beside them.
+
+    Args:
+        wearer: the body.
+        loop: the border, in order, shape ``(H, 3)`` [m].
+    """
+    if (wearer.surface.distance(loop) > THICKNESS - 1.0e-5).all():
+        return loop
+    rest = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
+    for _ in range(_LED_STEPS):
+        loop = wearer.outside(loop, THICKNESS, longest=_LED, steps=1)
+        for _ in range(_EVENING):
+            edge = np.roll(loop, -1, axis=0) - loop
+            length = np.linalg.norm(edge, axis=1)
+            excess = 1.0 - rest * (length.sum() / rest.sum()) / np.maximum(length, 1.0e-12)
+            move = 0.25 * excess[:, None] * edge
+            loop = loop + move - np.roll(move, 1, axis=0)
+    return wearer.outside(loop, THICKNESS)
 
 
 def _welded(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

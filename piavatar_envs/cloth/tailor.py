@@ -103,6 +103,7 @@ def make_garment(
         skin_weights=arrays["skin_weights"],
         shape_deltas=arrays["shape_deltas"] if grading else None,
         colors=arrays["colors"] if len(arrays["colors"]) else None,
+        source=arrays["source"] if len(arrays["source"]) else None,
         replaces=str(arrays["replaces"]),
     )
 
@@ -147,6 +148,7 @@ def _made(
         "skin_weights": weights,
         "shape_deltas": deltas.astype(np.float32),
         "colors": np.zeros((0, 3), np.uint8) if cut.colors is None else cut.colors,
+        "source": np.zeros((0, 3)) if cut.source is None or not cut.replaces else cut.source,
         "replaces": np.array(cut.replaces),
         **{field.name: np.asarray(getattr(mesh, field.name)) for field in fields(mesh)},
     }

@@ -12,7 +12,7 @@ from piavatar_envs.avatar.body.asset import AvatarAsset, turned_shares, vertex_n
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.skeleton import joint_index
 
-#: Steps and the largest step [m] in which points are brought out of the skin.
+#: Usual number of steps and the largest step [m] in which points are brought out of the skin.
 _STEPS, _LONGEST = 12, 0.03
 
 
@@ -92,16 +92,20 @@ class Wearer:
         _, face, coordinates = self.surface.query(points)
         return face, coordinates.astype(np.float64)
 
-    def outside(self, points: np.ndarray, gap: float | np.ndarray) -> np.ndarray:
+    def outside(
+        self, points: np.ndarray, gap: float | np.ndarray, longest: float = _LONGEST, steps: int = _STEPS
+    ) -> np.ndarray:
         """Return points moved out of the skin to a least distance from it.
 
         Args:
             points: shape ``(N, 3)`` [m].
             gap: the distance, of all or of each [m].
+            longest: step [m].
+            steps: at most so many.
         """
         points, low = np.array(points, np.float64), np.arange(len(points))
         gap = np.broadcast_to(gap, len(points))
-        for _ in range(_STEPS):
+        for _ in range(steps):
             distance, face, coordinates = self.surface.query(points[low])
             near = distance < gap[low] - 1.0e-5
             if not near.any():
@@ -109,5 +113,5 @@ class Wearer:
             low, short = low[near], (gap[low] - distance)[near]
             normals = np.einsum("nc,ncd->nd", coordinates[near], self.normals[self.faces[face[near]]])
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1.0e-12)
-            points[low] += np.minimum(short, _LONGEST)[:, None] * normals
+            points[low] += np.minimum(short, longest)[:, None] * normals
         return points

@@ -21,7 +21,7 @@ from piavatar_envs.avatar.body.textures import Textures
 from piavatar_envs.avatar.skin import Skin, motion_of, record_skin, skin_bytes, skin_workspace
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
-from piavatar_envs.render.garments import Drapery, bytes_of_garments, garment_names
+from piavatar_envs.render.garments import Drapery, garment_names
 from piavatar_envs.render.markers import MarkerMeshes, place_markers, unit_mesh, upload_meshes
 from piavatar_envs.render.scene import PALETTE, PROP, Color
 from piavatar_envs.render.splat_motion import BYTES_OF_SPLAT, SplatMotion
@@ -92,12 +92,17 @@ def bytes_of_stage(simulation: Simulation, markers: Sequence[MarkerSpec] = ()) -
     clouds = [(drawn.splats, particles) for drawn, particles in bodies if drawn.splats is not None]
     splats = sum(len(splats.cloud) for splats, _ in clouds)
     skins = sum(skin_bytes(particles) for _, particles in (*bodies, *clouds))
-    return BYTES_OF_VERTEX * vertices + BYTES_OF_SPLAT * splats + skins + bytes_of_garments(_garments(simulation))
+    return BYTES_OF_VERTEX * vertices + BYTES_OF_SPLAT * splats + skins + _drapery(simulation).bytes_of_picture
 
 
 def _garments(simulation: Simulation) -> Sequence[Garment]:
     """Return the garments of a simulation."""
     return () if simulation.garments is None else simulation.garments.garments
+
+
+def _drapery(simulation: Simulation) -> Drapery:
+    """Return the drawn surfaces of all garments of a simulation."""
+    return Drapery(_garments(simulation), [flesh.asset for flesh in simulation.flesh])
 
 
 def _drawn_assets(simulation: Simulation) -> list[AvatarAsset]:
@@ -161,7 +166,7 @@ class Stage:
         solids = tuple(simulation.subjects.collider_names[i] for i in self._colliders)
         worn = garment_names(_garments(simulation), names)
         self.subjects = ("ground", *names, *solids, *([MARKERS] if markers else []), *worn)
-        self._assets, self._drapery = _drawn_assets(simulation), Drapery(_garments(simulation))
+        self._assets, self._drapery = _drawn_assets(simulation), _drapery(simulation)
         self.skins = [self._bake(index) for index in range(len(simulation.avatars))]
         self.solids = [SolidSurface(own.rest, own.vertices, own.faces) for own in simulation.props.points]
         self._list_parts(names, markers)
@@ -228,7 +233,7 @@ class Stage:
         first = len(self.subjects) - len(self._drapery.meshes)
         for subject, mesh in enumerate(self._drapery.meshes, first):
             color = tuple(float(value) / 255.0 for value in mesh.colors[0])
-            self._add(subject, "garment", mesh.num_vertices, mesh.faces, color, mesh.colors)
+            self._add(subject, "garment", mesh.num_vertices, mesh.faces, color, mesh.colors, mesh.textures)
 
     def _add(
         self, subject: int, kind: str, count: int, faces: np.ndarray, color: Color, colors: np.ndarray | None = None,

@@ -27,18 +27,19 @@ class Subdivision:
     faces: np.ndarray
 
 
-def subdivided(faces: np.ndarray, num_vertices: int, levels: int) -> Subdivision:
+def subdivided(faces: np.ndarray, num_vertices: int, levels: int, smooth: bool = True) -> Subdivision:
     """Return a mesh divided ``levels`` times.
 
     Args:
         faces: triangles, shape ``(T, 3)``.
         num_vertices: number of coarse vertices ``V``.
         levels: each makes four triangles of one.
+        smooth: whether to average; else new vertices are in the middles of edges, and old ones stay.
     """
     matrix = sparse.eye_array(num_vertices, format="csr")
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
     for _ in range(levels):
-        step, faces = _divide(faces, matrix.shape[0])
+        step, faces = _divide(faces, matrix.shape[0], smooth)
         matrix = (step @ matrix).tocsr()
     matrix.sort_indices()
     return Subdivision(matrix, faces)
@@ -58,13 +59,13 @@ def levels_for(faces: np.ndarray, points: np.ndarray, edge: float, most: int = 2
     return int(np.clip(np.ceil(np.log2(max(length, 1e-12) / edge)), 0, most))
 
 
-def _divide(faces: np.ndarray, count: int) -> tuple[sparse.csr_array, np.ndarray]:
+def _divide(faces: np.ndarray, count: int, smooth: bool) -> tuple[sparse.csr_array, np.ndarray]:
     """Divide once: return the matrix ``(count + edges, count)`` and four triangles for each."""
     start, end, opposite = faces.ravel(), np.roll(faces, -1, axis=1).ravel(), np.roll(faces, -2, axis=1).ravel()
     sides = np.sort(np.stack([start, end], axis=1), axis=1)
     edges, index, sharers = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
     index = index.ravel()
-    inner = sharers == 2
+    inner = (sharers == 2) & smooth
     low, high = edges.T
     middles = count + np.arange(len(edges))
     ends = np.where(inner, 0.375, 0.5)
@@ -80,13 +81,13 @@ def _divide(faces: np.ndarray, count: int) -> tuple[sparse.csr_array, np.ndarray
     # a corner, where other than two borders meet or one triangle ends, stays
     triangles = np.bincount(faces.ravel(), minlength=count)
     spline = (border == 2) & (triangles > 1)
-    smooth = (border == 0) & (valence > 0)
-    own = np.where(smooth, 1.0 - valence * beta, np.where(spline, 0.75, 1.0))
+    inside = (border == 0) & (valence > 0)
+    own = np.where(inside, 1.0 - valence * beta, np.where(spline, 0.75, 1.0))
     rows.append(np.arange(count))
     columns.append(np.arange(count))
     values.append(own)
     for vertex, other in ((low, high), (high, low)):
-        share = np.where(smooth[vertex], beta[vertex], np.where(spline[vertex] & ~inner, 0.125, 0.0))
+        share = np.where(inside[vertex], beta[vertex], np.where(spline[vertex] & ~inner, 0.125, 0.0))
         used = share != 0.0
         rows.append(vertex[used])
         columns.append(other[used])

@@ -67,7 +67,7 @@ def tailor(config: EnvConfig, flesh: Sequence[Flesh]) -> list[Garment]:
                 garment = make_garment(given.kind, given.settings, given.cloth, *wearer)
             except (OSError, TypeError, ValueError) as error:
                 raise ConfigError(f"garments: {error}") from None
-            garments.append(garment if given.color is None else replace(garment, colors=None))
+            garments.append(garment if given.color is None else replace(garment, colors=None, source=None))
     return garments
 
 

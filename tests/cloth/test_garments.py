@@ -149,6 +149,21 @@ def test_a_fine_file_put_on_askew_is_meshed_anew_and_brought_out_of_the_skin(tmp
     check_mesh(cut, wearer, 0.06)
 
 
+def test_a_waist_that_is_too_narrow_is_stretched_evenly(tmp_path, wearers):
+    """Check that a held border inside of the body comes out of it without crowding; each vertex alone would."""
+    wearer = wearers["mean"]
+    source = cut_garment("skirt", wearer, {"edge": EDGE})
+    middle = source.positions[source.held].mean(axis=0)
+    narrow = (source.positions - middle) * (0.8, 0.8, 1.0) + middle + (0.0, 0.03, 0.0)
+    cut = cut_garment("mesh", wearer, {"path": write_obj(tmp_path / "n.obj", narrow, source.faces), "edge": EDGE})
+    ring = np.stack([cut.held, np.roll(cut.held, -1)], axis=1)
+    length = np.linalg.norm(cut.positions[ring[:, 0]] - cut.positions[ring[:, 1]], axis=1)
+    stretch = length / cut.measure(ring)
+    assert stretch.mean() > 1.1 and stretch.max() < 1.5 * stretch.min()
+    distance = wearer.surface.distance(cut.positions[cut.held])
+    assert distance.min() > 0.9 * cut.thickness and np.ptp(cut.positions[cut.held, 2]) < 0.06
+
+
 def test_files_that_are_no_garment_are_refused(tmp_path, wearers):
     wearer = wearers["mean"]
     source = cut_garment("skirt", wearer, {"edge": EDGE})

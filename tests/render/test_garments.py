@@ -10,7 +10,10 @@ import pytest
 from piavatar_envs.api.pictures import MouseForce, SceneReader, grip_at
 from piavatar_envs.avatar.body.outfit import KITS
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
+from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.srgb import linear_to_srgb
+from piavatar_envs.render.film_files import film_writer
 from piavatar_envs.render.garments import GarmentMesh, both_sides, garment_names
 from piavatar_envs.render.live import Drag
 from piavatar_envs.render.painter import Painter
@@ -19,6 +22,7 @@ from piavatar_envs.render.views import Shot, view_rows
 from piavatar_envs.render.wearing import sinking
 from tests.render.batches import seen
 from tests.render.cloth import COLORS, tube, worn_by
+from tests.render.test_film_files import played
 
 REACH = "PIAvatar/Reach-v0"
 
@@ -175,6 +179,57 @@ def bone_at(batch, place: np.ndarray) -> int:
     x = batch.simulation.state.x.numpy()[1, body.first : body.first + body.count]
     nearest = np.linalg.norm(x - place, axis=1).argmin()
     return int(batch.simulation.flesh[0].sampled.skin_joints[nearest, 0])
+
+
+@pytest.fixture(scope="module")
+def film(make_batch):
+    """Return the scenes of a body in a skirt that rises, and the places of the skirt's two sides in each."""
+    batch, skirt = make_batch(REACH, 2), tube(0.5, 0.9, 0.2)
+    batch.reset(seeds=[0, 1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch.simulation, "garments", worn_by(batch.simulation, skirt), raising=False)
+        reader, x, scenes = SceneReader(batch), batch.simulation.garments.cloth.state.x, []
+        for _ in range(3):
+            scenes.append(reader.scene(0))
+            x.assign(x.numpy() + np.float32([0.0, 0.0, 0.1]))
+    return scenes, [scene.bodies[1].vertices.copy() for scene in scenes]
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply", "usd"])
+def test_films_have_garments(film, kind, tmp_path):
+    """Check that a file has both sides of a skirt in their colours, where it was in every frame."""
+    if kind == "usd":
+        pytest.importorskip("pxr.Usd", reason="needs the extra usd")
+    scenes, places = film
+    assert np.ptp([place[0, 2] for place in places]) == pytest.approx(0.2, abs=1e-3)
+    writer = film_writer(tmp_path, kind, 25.0)
+    for scene in scenes:
+        writer.add(scene)
+    paths, (faces, colors) = writer.finish(), (scenes[0].bodies[1].faces, scenes[0].bodies[1].colors)
+    if kind == "glb":
+        gltf = read_gltf(paths[0])
+        positions, _ = played(gltf, gltf.names.index("body_1"))
+        own = gltf.json["meshes"][gltf.names.index("body_1")]["primitives"][0]
+        triangles = gltf.accessor(own["indices"]).reshape(-1, 3)
+        painted = 255.0 * linear_to_srgb(gltf.accessor(own["attributes"]["COLOR_0"])[:, :3])
+    elif kind == "ply":
+        trimesh = pytest.importorskip("trimesh")
+        (folder,) = (path for path in paths if path.name == "body_1")
+        meshes = [trimesh.load(folder / f"{frame:04d}.ply", process=False) for frame in range(3)]
+        positions, triangles = np.stack([mesh.vertices for mesh in meshes]), meshes[0].faces
+        painted = meshes[0].visual.vertex_colors[:, :3]
+    else:
+        from pxr import Usd, UsdGeom
+
+        stage = Usd.Stage.Open(str(paths[0]))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/film/body_1"))
+        positions = np.stack([mesh.GetPointsAttr().Get(frame) for frame in range(3)])
+        triangles = np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3))
+        painted = 255.0 * linear_to_srgb(np.array(mesh.GetDisplayColorAttr().Get(0)))
+    np.testing.assert_allclose(positions, places, atol=1e-5)
+    np.testing.assert_array_equal(triangles, faces)
+    np.testing.assert_allclose(painted, colors, atol=0.6)
+    assert len(np.unique(colors, axis=0)) == 2
 
 
 def test_names_are_of_the_wearer_and_the_kind():

@@ -25,7 +25,7 @@ def cut(
     held: Holding = "top",
     edge: Edge = 0.03,
 ) -> Cut:
-    """Return a garment of a surface that is worn, in the colours of the file.
+    """Return a garment of a surface that is worn, in the colours and with the textures of the file.
 
     Args:
         wearer: the body, in its rest pose.
@@ -39,10 +39,10 @@ def cut(
     name, own = _surface(wearer, surface)
     points = _placed(wearer, own.vertices.astype(np.float64))
     cloth = sheet_of(wearer, name, *welded_pieces(points, own.faces), held, edge)
-    colors = None
-    if own.colors is not None:
-        colors = own.colors[cKDTree(points).query(cloth.positions)[1]]
-    return replace(cloth, colors=colors, replaces=name)
+    # the same vertices in the mean shape, as the avatar's look has them
+    rows = cKDTree(points).query(cloth.source)[1]
+    colors = None if own.colors is None else own.colors[rows]
+    return replace(cloth, colors=colors, source=own.vertices[rows].astype(np.float64), replaces=name)
 
 
 def _placed(wearer: Wearer, points: np.ndarray) -> np.ndarray:
