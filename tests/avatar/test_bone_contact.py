@@ -19,12 +19,13 @@ from piavatar_envs.avatar.torque_control.bone_contact import (
     least_speed,
     may_violate,
     measure_bones,
-    touch_of,
+    nth_touch,
 )
 from piavatar_envs.avatar.torque_control.joint_motion import spread_motion
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider
 from tests.avatar.articulated import Joints
 
@@ -246,9 +247,9 @@ def test_sensors_report_all_that_the_floor_gives(fall):
 
 @wp.kernel(enable_backward=False)
 def move_bones(body: Body, q: wp.array2d(dtype=float), w: TorqueWorkspace):
-    """Store the motion of bones under velocities ``q`` of joints, and boxes around their points."""
+    """Store the motion of bones under velocities ``q`` of joints, and boxes around their hulls."""
     e = wp.tid()
-    measure_bones(body, e, 0, 1, w)
+    measure_bones(body, 1, e, 0, 1, w)
     spread_motion(body, w.pose.position, q, e, e, 0, 1, w.moving)
 
 
@@ -267,8 +268,9 @@ def look(
     for k in range(ground.boundaries.count):
         may[e, b, k] = int(may_violate(ground.boundaries, dt, w, e, b, k))
         lacking = float(-1.0e9)
-        for tracker in range(body.tracker_start[b], body.tracker_start[b + 1]):
-            touch = touch_of(body, ground.boundaries, w, e, b, tracker, k)
+        points = body.tracker_start[b + 1] - body.tracker_start[b]
+        for n in range(points + 1):  # its deepest point, too
+            touch = nth_touch(body, ground, w, e, b, n, k)
             lacking = wp.max(lacking, least_speed(touch.distance, dt) - wp.dot(touch.velocity, touch.normal))
         most[e, b, k] = lacking
     if b == 0:
@@ -307,6 +309,9 @@ def test_no_bone_is_skipped_of_which_a_point_is_too_fast(make_rig, wild_pose, de
         wp.launch(move_bones, n, [body.body, velocity, workspace], device=device)
         may = wp.zeros((n, NUM_JOINTS, count), dtype=int, device=device)
         most, fastest = wp.zeros(may.shape, dtype=float, device=device), wp.zeros(n, dtype=wp.vec2, device=device)
+        hulls = LaunchGraph(device)
+        body._hulls.record(hulls, body.pose, rig.state.failure)
+        hulls.run()
         inputs = [body.body, ground, dt, workspace]
         wp.launch(look, (n, NUM_JOINTS), inputs, [may, most, fastest], device=device)
         lacking, seen = most.numpy(), may.numpy() != 0

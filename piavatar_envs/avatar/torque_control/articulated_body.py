@@ -91,6 +91,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body.device import BodyPoints, partition_body
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.bone_hulls import BoneHulls
 from piavatar_envs.avatar.segment_sums import ALL_WORDS, PARTITION_THREADS, sum_moments, warps_of
 from piavatar_envs.avatar.torque_control.bone_contact import Ground
 from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, find_places, put_in_place, split_velocity
@@ -180,6 +181,7 @@ class ArticulatedBody:
         self.target = allocate(Target, n, device, **given)
         self.target.rotation.fill_(wp.quat_identity())
         self.solid = solid
+        self._hulls = BoneHulls(body, model, solid)
         self.mass = MassMatrix(points, body, model)
         self._inertia = grid_inertia(points, model.grid.dx)
         words = ALL_WORDS * points.num_points if self.threads == 1 else 0
@@ -252,7 +254,8 @@ class ArticulatedBody:
 
     def record_pose(self, graph: LaunchGraph, state: State) -> None:
         """Append the computation of the bones' places and motion, for joints that were not moved by a substep."""
-        self._record_stage(graph, begin_substep, [self.body], state)
+        hulls = int(self._hulls.deepest.size > 0)
+        self._record_stage(graph, begin_substep, [self.body, hulls], state)
 
     def record_mass(self, graph: LaunchGraph, state: State) -> None:
         """Append the sums of the bones' moments and the mass matrix, outside of a substep."""
@@ -294,6 +297,7 @@ class ArticulatedBody:
         self._record_pull(graph, state, step / model.num_substeps)
         if fit:
             self._record_mass(graph, state)
+        self._hulls.record(graph, self.pose, state.failure)
         inputs = [self.body, model.step.dt, 1.0 / model.control_dt, 3 if fit else 2]
         inputs += [self.target, self.springs, self.tissue, self.strength]
         self._record_stage(graph, act, inputs, state, self._ground(scratch), self.support)
@@ -307,6 +311,7 @@ class ArticulatedBody:
             Ground,
             solid=int(self.solid),
             boundaries=model.boundaries,
+            deepest=self._hulls.deepest,
             field=model.particles.field,
             subject=model.contact.subject,
             sensors=scratch.sensors,

@@ -19,13 +19,14 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.bone_hulls import NOWHERE, rest_offset
 from piavatar_envs.avatar.skinning import motion_at
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple, spread_motion, triple_of
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, NUM_DOF
 from piavatar_envs.avatar.torque_control.tree_cholesky import begin_solution, end_solution
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, place_of_triple, row_in_arena, view_columns
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.core.arrays import vec8, vector_at
+from piavatar_envs.core.arrays import vec8
 from piavatar_envs.core.cuda_intrinsics import max_of_threads, or_of_threads, sum_threads6, sync_threads
 from piavatar_envs.mpm.colliders import PLANE, signed_distance, surface_velocity
 from piavatar_envs.mpm.contact_sensors import add_impulse, boundary_entry, moment_entry
@@ -50,6 +51,9 @@ class Ground:
 
     solid: int  # whether bones stop at all
     boundaries: Boundaries
+    # (num_envs, bones * boundaries) deepest point of a bone in a boundary, see piavatar_envs.avatar.bone_hulls [m];
+    # without columns where all are planes
+    deepest: wp.array2d(dtype=wp.vec3)
     field: wp.array(dtype=int)  # (num_particles,) velocity field, which selects the friction
     subject: wp.array(dtype=int)  # (fields,) sensor subject of a field
     sensors: Sensors
@@ -66,15 +70,9 @@ class Touch:
 
 
 @wp.func
-def rest_offset(body: Body, e: int, b: int, tracker: int):
-    """Return the offset from a joint to a point of its bone in the rest pose [m]; the point by its tracker index."""
-    joint = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
-    return vector_at(body.rest, row(e, body.rest.shape[0]), body.tracker[tracker]) - joint
-
-
-@wp.func
-def measure_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Compute the bounding boxes of the bones' points, for the current body."""
+def measure_bones(body: Body, hulls: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
+    """Compute the bounding boxes of the bones' points, for the current body; of their ``hulls`` if not 0."""
+    r = row(e, body.rest_joint.shape[0])
     for b in range(thread, BONES, threads):
         low = wp.vec3(_FAR)
         high = wp.vec3(-_FAR)
@@ -82,6 +80,12 @@ def measure_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorksp
             point = rest_offset(body, e, b, tracker)
             low = wp.min(low, point)
             high = wp.max(high, point)
+        if hulls != 0:
+            for child in range(b, BONES):  # children come after their parents
+                if child == b or body.parent[child] == b:
+                    point = body.rest_joint[r, child] - body.rest_joint[r, b]
+                    low = wp.min(low, point)
+                    high = wp.max(high, point)
         w.middle[e, b] = 0.5 * (low + high)
         w.half[e, b] = 0.5 * (high - low)  # negative for a bone without points
 
@@ -95,13 +99,32 @@ def motion_of_bone(w: TorqueWorkspace, e: int, b: int, x: wp.vec3):
 @wp.func
 def touch_of(body: Body, boundaries: Boundaries, w: TorqueWorkspace, e: int, b: int, tracker: int, k: int) -> Touch:
     """Return the contact of a point of bone ``b``, by its tracker index, with boundary ``k``."""
+    place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], rest_offset(body, e, b, tracker))
+    return touch_at(boundaries, w, e, b, place, k)
+
+
+@wp.func
+def touch_at(boundaries: Boundaries, w: TorqueWorkspace, e: int, b: int, place: wp.vec3, k: int) -> Touch:
+    """Return the contact of bone ``b`` at ``place`` with boundary ``k``."""
     touch = Touch()
-    touch.place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], rest_offset(body, e, b, tracker))
+    touch.place = place
     d = signed_distance(boundaries, e, k, touch.place)
     touch.normal = wp.vec3(d[0], d[1], d[2])
     touch.distance = d[3]
     touch.velocity = motion_of_bone(w, e, b, touch.place) - surface_velocity(boundaries, e, k, touch.place)
     return touch
+
+
+@wp.func
+def nth_touch(body: Body, ground: Ground, w: TorqueWorkspace, e: int, b: int, n: int, k: int) -> Touch:
+    """Return the contact of point ``n`` of bone ``b`` with boundary ``k``; beyond the last, of its deepest point."""
+    tracker = body.tracker_start[b] + n
+    if tracker < body.tracker_start[b + 1]:
+        return touch_of(body, ground.boundaries, w, e, b, tracker, k)
+    place = ground.deepest[e, b * ground.boundaries.count + k]
+    if place[0] >= NOWHERE:
+        return Touch(place, wp.vec3(), NOWHERE, wp.vec3())
+    return touch_at(ground.boundaries, w, e, b, place, k)
 
 
 @wp.func
@@ -169,10 +192,10 @@ def find_fastest(
     b = int(0)
     while near != 0:
         if (near & 1) != 0:
-            first = body.tracker_start[b]
-            for n in range(thread, body.tracker_start[b + 1] - first, threads):
+            points = body.tracker_start[b + 1] - body.tracker_start[b]
+            for n in range(thread, points + wp.min(ground.deepest.shape[1], 1), threads):
                 for k in range(count):
-                    touch = touch_of(body, ground.boundaries, w, e, b, first + n, k)
+                    touch = nth_touch(body, ground, w, e, b, n, k)
                     lacking = least_speed(touch.distance, dt) - wp.dot(touch.velocity, touch.normal)
                     if lacking > most:
                         most = lacking
@@ -302,9 +325,10 @@ def stop_point(
     boundaries = ground.boundaries
     k = which % boundaries.count
     b = which // boundaries.count % BONES
-    tracker = body.tracker_start[b] + which // (boundaries.count * BONES)
-    touch = touch_of(body, boundaries, w, e, b, tracker, k)
+    n = which // (boundaries.count * BONES)
+    touch = nth_touch(body, ground, w, e, b, n, k)
     mobility = mobility_at(body, factor, e, b, touch.place, thread, threads, arena, w)
+    tracker = wp.min(body.tracker_start[b] + n, body.tracker_start[b + 1] - 1)
     field = ground.field[body.first + body.tracker[tracker]]
     friction = boundaries.friction[row(e, boundaries.friction.shape[0]), field * boundaries.count + k]
     p = stopping_impulse(mobility, touch.velocity, touch.normal, least_speed(touch.distance, dt), friction)

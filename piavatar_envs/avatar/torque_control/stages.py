@@ -341,11 +341,14 @@ def build_mass(
 @wp.kernel
 def begin_substep(
     body: Body,
+    hulls: int,
     failure: wp.array(dtype=int),
     # in and out
     w: TorqueWorkspace,
 ):
     """Run :func:`begin` for joints that were not moved by a substep, or whose body has changed.
+
+    ``hulls`` are as in :func:`~piavatar_envs.avatar.torque_control.bone_contact.measure_bones`.
 
     Over ``(num_envs, WARP)``, a CUDA block for each environment.
     """
@@ -355,7 +358,7 @@ def begin_substep(
     thread = at[1]
     threads = at[2]
     if failure[e] == 0:
-        measure_bones(body, e, thread, threads, w)
+        measure_bones(body, hulls, e, thread, threads, w)
         begin(body, e, thread, threads, w)
 
 
