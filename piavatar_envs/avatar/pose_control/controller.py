@@ -14,6 +14,7 @@ from piavatar_envs.avatar.body.device import BodyPoints
 from piavatar_envs.avatar.body.flesh import weight_loads
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.correctives import turn_joints
+from piavatar_envs.avatar.pose_control.bone_contact import PoseBoneContact
 from piavatar_envs.avatar.pose_control.bones import begin_control, end_control
 from piavatar_envs.avatar.pose_control.injection import bone_matrices, inject_velocity
 from piavatar_envs.avatar.pose_control.kernels import (
@@ -104,6 +105,7 @@ class PoseController:
         w = self.workspace
         swapped = {name: getattr(w, name) for name in PoseWorkspace.vars} | {"now": w.after, "after": w.now}
         self._workspaces = w, make_struct(PoseWorkspace, **swapped)
+        self._contact = PoseBoneContact(avatar.body, parameters, model)
         # only injection blends whole matrices
         matrices = (n, NUM_JOINTS if self._injects else 0)
         self._bone_from, self._bone_step = (wp.zeros(matrices, dtype=wp.mat44, device=model.device) for _ in range(2))
@@ -147,6 +149,8 @@ class PoseController:
             graph.launch(command_body, avatar.model.num_envs, inputs, outputs)
         else:
             self._record_passes(graph, state, step)
+        if not self._injects:
+            self._contact.record(graph, state, scratch, self._workspaces[step % 2], self._root.released)
 
     def _record_passes(self, graph: LaunchGraph, state: State, step: int) -> None:
         """Append the stages of :func:`command_body`, with a launch for each pass over particles."""
