@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
@@ -10,11 +11,23 @@ import warp as wp
 from piavatar_envs.core.arrays import allocate_matrices, components_of, vec4l, whole_lines
 from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.bspline import BLOCK, BLOCK_NODES
+from piavatar_envs.mpm.colliders import make_boundaries
 from piavatar_envs.mpm.contact_sensors import senses_in_g2p
 from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, plan_arena
 from piavatar_envs.mpm.grid_arrays import choose_quanta
 from piavatar_envs.mpm.sparse_grid import UNASSIGNED, max_contact_blocks, tracks_contact_nodes
-from piavatar_envs.mpm.types import Accumulators, Blocks, Grid, Model, Scratch, Sensors, State
+from piavatar_envs.mpm.types import (
+    DECOUPLING,
+    Accumulators,
+    Blocks,
+    Grid,
+    Model,
+    Retained,
+    Scratch,
+    Sensors,
+    State,
+    Step,
+)
 
 #: Active blocks that a body may need, over those at rest. Random full-scale actions and shapes reached 1.2.
 ACTIVE_MARGIN = 1.7
@@ -92,7 +105,7 @@ def estimate_bytes(
     num_blocks: int = 0,
     path: str = "plain",
 ) -> int:
-    """Estimate the device memory of state and scratch [bytes].
+    """Estimate the device memory of state and scratch, where nothing is retained [bytes].
 
     120 B a particle; 80 B a node, 48 more in fixed point, 32 less with sums in shared memory, 32 more with several
     fields; and the map of blocks.
@@ -161,8 +174,30 @@ def allocate(model: Model) -> tuple[State, Scratch]:
         arena=arena,
         large_arena=large_arena,
         positions=None if model.thin_colliders is None else _zeros(model, particles, wp.vec3),
+        retained=allocate_retained(model),
+        unforced=None if model.retained_share is None else without_forces(model),
     )
     return state, scratch
+
+
+def without_forces(model: Model) -> Model:
+    """Return a model without stress, gravity and colliders."""
+    step = Step()
+    step.dt, step.gravity, step.decoupling = model.step.dt, wp.vec3(0.0), DECOUPLING["no_stress"]
+    return replace(model, step=step, boundaries=make_boundaries((), model.contact.num_fields, 1, model.device))
+
+
+def allocate_retained(model: Model) -> Retained | None:
+    """Allocate what particles retain; None where nothing is retained."""
+    if model.retained_share is None:
+        return None
+    particles = (model.num_envs, model.num_particles)
+    return make_struct(
+        Retained,
+        share=model.retained_share,
+        u=_zeros(model, particles, wp.vec3),
+        C=allocate_matrices(*particles, model.device),
+    )
 
 
 def _zeros(model: Model, shape: int | tuple[int, ...], dtype: type) -> wp.array:
@@ -211,6 +246,9 @@ def allocate_sensors(model: Model, records: tuple[int, int]) -> Sensors:
     n, subjects = model.num_envs, model.contact.num_subjects
     rows = max(1, model.num_sensors)
     entries = subjects * (2 + subjects + rows)
+    # the block path clears these flags of a single field as well where G2P is a launch of its own
+    flagged = model.contact.num_fields > 1 or model.retained_share is not None
+    touched = (n, model.max_active_blocks) if flagged else (1, 1)
     return make_struct(
         Sensors,
         accumulators=_zeros(model, (n, 3 * entries), wp.int64),
@@ -219,7 +257,7 @@ def allocate_sensors(model: Model, records: tuple[int, int]) -> Sensors:
         pair_impulse=_zeros(model, (n, subjects * subjects), wp.vec3),
         part_impulse=_zeros(model, (n, rows, subjects), wp.vec3),
         node=_zeros(model, records, wp.vec4),
-        touched=_zeros(model, (records[0], -(-records[1] // int(BLOCK_NODES))), int),
+        touched=_zeros(model, touched, int),
         penetration=_zeros(model, (n, subjects), float),
         limited_sum=_zeros(model, (n, 2), wp.int64),
         limited=_zeros(model, n, float),

@@ -15,6 +15,7 @@ from piavatar_envs.mpm.cuda.block_grid import MOST_LISTED, MOST_PARTICLES, large
 from piavatar_envs.mpm.cuda.tiled_p2g import plan_tiles
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.memory import bound_active_blocks, check_memory, choose_activation_interval
+from piavatar_envs.mpm.retention import retained_share
 from piavatar_envs.mpm.thin_colliders import thin_colliders
 from piavatar_envs.mpm.types import (
     CFL_STABLE,
@@ -292,6 +293,7 @@ def build_model(
     device: str = "cpu",
     control_dt: float = 1.0 / 30.0,
     num_substeps: int | None = None,
+    reference_substeps: int | None = None,
     cfl: float = 0.5,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
     decoupling: str = "split",
@@ -317,6 +319,8 @@ def build_model(
         fields: velocity fields; a single body if not given.
         decoupling: a key of ``DECOUPLING``.
         num_substeps: substeps of a control step; from the CFL limit if not given.
+        reference_substeps: substeps whose damping of short waves further substeps keep, see
+            :mod:`piavatar_envs.mpm.retention`; each substep damps them if not given.
         cfl: Courant number ``c dt / dx`` of that choice.
         sound_speed: elastic wave speed to design for [m/s], where parameters will be randomised.
         limiting_speed: speed of :meth:`MaterialPoints.limiting_speed` to design for, likewise [m/s].
@@ -344,6 +348,9 @@ def build_model(
     max_active_blocks = bound_active_blocks(max_active_blocks, points.fields, grid, fields.num_fields)
     path = choose_path(path, device, points.fields, max_active_blocks, decoupling)
     layout = max_active_blocks, device, fields.num_fields, grid.num_blocks, path
+    share = retained_shares(points.fields, fields, num_substeps, reference_substeps, decoupling)
+    if share is not None:
+        more_bytes += 48 * points.num_particles
     check_memory(num_envs, points.num_particles, *layout, more_bytes=more_bytes)
     thin = thin_colliders(colliders, grid.dx)
     step = Step()
@@ -368,7 +375,22 @@ def build_model(
         activation_interval=choose_activation_interval(path, points.fields),
         path=path,
         thin_colliders=wp.array(thin, dtype=int, device=device) if thin else None,
+        retained_share=None if share is None else wp.array(share, dtype=float, device=device),
     )
+
+
+def retained_shares(
+    field: np.ndarray, fields: Fields, num_substeps: int, reference: int | None, decoupling: str
+) -> np.ndarray | None:
+    """Return the share that particles of velocity fields ``field`` retain, shape ``(num_particles,)``; None for none.
+
+    Substeps beyond the ``reference`` retain it, with the ``"split"`` decoupling. Fields apart, such as garments, retain
+    nothing.
+    """
+    if reference is None or num_substeps <= reference or decoupling != "split":
+        return None
+    share = retained_share(num_substeps / reference)
+    return np.where(np.isin(field, fields.apart), 0.0, share).astype(np.float32)
 
 
 def choose_path(path: str | None, device: str, field: np.ndarray, max_active_blocks: int, decoupling: str) -> str:

@@ -35,6 +35,7 @@ from piavatar_envs.mpm.cuda.tiled_p2g import record_tiled_p2g
 from piavatar_envs.mpm.g2p import g2p
 from piavatar_envs.mpm.grid_update import blocks_at_once, threads_per_active_block, update_grid
 from piavatar_envs.mpm.p2g import p2g
+from piavatar_envs.mpm.retention import record_add, record_free_velocities, record_store
 from piavatar_envs.mpm.sparse_grid import (
     THREADS,
     activate_particle_blocks,
@@ -60,12 +61,18 @@ def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scra
         record_activation(graph, *simulated)
     if model.thin_colliders is not None:
         graph.launch(store_positions, state.x.shape, [state.x], [scratch.positions])
+    if model.path == "block" and index == 0:
+        graph.launch(reset_speeds, scratch.arena.speed.shape, [scratch.arena])
+    if scratch.retained is not None:
+        record_retained(graph, *simulated)
     if model.path == "block":
-        record_block_substep(graph, *simulated, first=index == 0)
+        record_block_substep(graph, *simulated)
     else:
         record_p2g(graph, *simulated)
         record_grid_update(graph, *simulated)
         record_g2p(graph, *simulated)
+    if scratch.retained is not None:
+        record_add(graph, *simulated, _moving(state))
     if model.thin_colliders is not None:
         m = model
         graph.launch(
@@ -91,6 +98,18 @@ def record_activation(graph: LaunchGraph, model: Model, state: State, scratch: S
     )
     if tracks_contact_nodes(model):
         graph.launch(reset_contact_nodes, (model.num_envs, model.max_active_blocks), [], [blocks])
+
+
+def record_retained(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
+    """Append what particles retain in the substep, from P2G without forces; see :mod:`piavatar_envs.mpm.retention`."""
+    unforced, moving = scratch.unforced, _moving(state)
+    assert unforced is not None
+    if model.path == "block":
+        record_in_block(graph, unforced, state, scratch, moving, with_g2p=False)
+    else:
+        record_p2g(graph, unforced, state, scratch)
+    record_free_velocities(graph, unforced, scratch)
+    record_store(graph, model, state, scratch, moving)
 
 
 def record_p2g(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
@@ -175,16 +194,15 @@ def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch)
         )
 
 
-def record_block_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scratch, first: bool) -> None:
-    """Append the three stages on the path ``"block"``; ``first`` in the control step, it resets the speeds.
+def record_block_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
+    """Append the three stages on the path ``"block"``.
 
     One launch has P2G, the grid update and, with a single velocity field, G2P. Contact between fields needs all of
     them, so with several fields it follows, and G2P after it.
     """
-    if first:
-        graph.launch(reset_speeds, scratch.arena.speed.shape, [scratch.arena])
-    record_in_block(graph, model, state, scratch, _moving(state))
-    if model.contact.num_fields > 1:
+    several = model.contact.num_fields > 1
+    record_in_block(graph, model, state, scratch, _moving(state), with_g2p=not several)
+    if several:
         _record_contact(graph, model, state, scratch)
         _record_contact_sensors(graph, model, state, scratch)
         record_g2p(graph, model, state, scratch)

@@ -223,6 +223,15 @@ class Moving:
 
 
 @wp.struct
+class Retained:
+    """Velocities that particles retain in a substep; see :mod:`piavatar_envs.mpm.retention`."""
+
+    share: wp.array(dtype=float)  # (num_particles,) of what is filtered from them
+    u: wp.array2d(dtype=wp.vec3)  # (num_envs, num_particles) [m/s]
+    C: wp.array3d(dtype=float)  # (num_envs, 9, num_particles) [1/s]
+
+
+@wp.struct
 class Kinematic:
     """Prescribed motion of particles, each of shape ``(num_envs, num_particles)``; see :class:`State`."""
 
@@ -258,6 +267,8 @@ class Model:
         activation_interval: substeps between activations of blocks.
         path: path of P2G and G2P, one of :data:`PATHS`.
         thin_colliders: indices of the colliders of :mod:`piavatar_envs.mpm.thin_colliders`; None without any.
+        retained_share: of each particle, shape ``(num_particles,)``, see :mod:`piavatar_envs.mpm.retention`; None where
+            nothing is retained.
     """
 
     num_envs: int
@@ -277,6 +288,7 @@ class Model:
     activation_interval: int
     path: str
     thin_colliders: wp.array | None = None
+    retained_share: wp.array | None = None
 
     @property
     def num_blocks(self) -> int:
@@ -327,6 +339,8 @@ class Scratch:
         arena: shared memory of the block-per-environment path.
         large_arena: whether an arena takes a multiprocessor of its own.
         positions: of the particles before G2P [m]; None unless colliders are thin.
+        retained: what particles retain in a substep; None where nothing is retained.
+        unforced: the model without stress, gravity and colliders, for P2G of what is retained; None likewise.
     """
 
     blocks: Blocks
@@ -337,3 +351,5 @@ class Scratch:
     arena: Arena
     large_arena: bool
     positions: wp.array | None
+    retained: Retained | None
+    unforced: Model | None

@@ -29,6 +29,8 @@ from piavatar_envs.sim.scene import Domain
 HINGES = ("left_knee", "right_knee", "left_elbow", "right_elbow")
 #: Greatest speed of flesh that a fast collider strikes, over the collider's speed.
 STRUCK = 1.5
+#: Courant number of substeps that are not configured.
+USUAL_CFL = float(PhysicsConfig.model_fields["cfl"].default)
 #: Mass of a bone with its flesh in the lightest random body, over that in the body that was built.
 LIGHTEST = 0.5
 
@@ -63,13 +65,11 @@ def choose_substeps(
     """
     physics = config.physics
     mode, given = config.control.mode, physics.num_substeps
-    least = 1 if mode == "pose" else math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
+    least = _least(config)
+    if given is None:
+        return max(least, _fewest(physics, dx, wave, _moving_speed(config, scene, domain, flesh, solids, impulses)))
     thing = fastest_thing(scene, solids, domain, physics.gravity)
     blow = fastest_blow(impulses, flesh, config.randomize.mass_factor[0])
-    if given is None:
-        commanded = commanded_speed(config.control, select_joints(config.joints), flesh)
-        moving = max(commanded, STRUCK * thing[1], blow[1])
-        return max(least, _fewest(physics, dx, wave, moving))
     name, speed = max(thing, blow, key=lambda found: found[1])
     fewest = choose_num_substeps(physics.control_dt, dx, speed, 1.0)
     if given < fewest:
@@ -83,6 +83,45 @@ def choose_substeps(
             f"for control.mode={mode!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {least}"
         )
     return given
+
+
+def reference_substeps(
+    config: EnvConfig,
+    scene: SceneConfig,
+    domain: Domain,
+    flesh: Sequence[Flesh],
+    solids: Sequence[PropPoints],
+    impulses: Mapping[str, float],
+    dx: float,
+    wave: float,
+) -> int:
+    """Return the substeps a control step whose damping of short waves further ones keep, whatever is configured.
+
+    They are those of elastic flesh and moving parts at the usual Courant number (:mod:`piavatar_envs.mpm.retention`).
+    ``wave`` is the speed of the fastest elastic wave, of the avatars and what they wear alone [m/s]; the other
+    arguments are those of :func:`choose_substeps`.
+    """
+    speed = max(wave, USUAL_CFL * _moving_speed(config, scene, domain, flesh, solids, impulses))
+    return max(_least(config), choose_num_substeps(config.physics.control_dt, dx, speed, USUAL_CFL))
+
+
+def _moving_speed(
+    config: EnvConfig,
+    scene: SceneConfig,
+    domain: Domain,
+    flesh: Sequence[Flesh],
+    solids: Sequence[PropPoints],
+    impulses: Mapping[str, float],
+) -> float:
+    """Return the greatest speed of anything that moves [m/s]; the arguments are those of :func:`choose_substeps`."""
+    thing = fastest_thing(scene, solids, domain, config.physics.gravity)
+    blow = fastest_blow(impulses, flesh, config.randomize.mass_factor[0])
+    return max(commanded_speed(config.control, select_joints(config.joints), flesh), STRUCK * thing[1], blow[1])
+
+
+def _least(config: EnvConfig) -> int:
+    """Return the fewest substeps that control takes."""
+    return 1 if config.control.mode == "pose" else math.ceil(config.physics.control_dt / LONGEST_SUBSTEP - 1e-9)
 
 
 def _fewest(physics: PhysicsConfig, dx: float, wave: float, speed: float) -> int:

@@ -36,7 +36,7 @@ from piavatar_envs.sim.resolution import GRID_PER_HEIGHT, check_sizes
 from piavatar_envs.sim.scene import Domain, assemble
 from piavatar_envs.sim.shapes import Shapes, check_shape_names
 from piavatar_envs.sim.shells import ShellGarments, bytes_of_shells, shell_matter, with_shells
-from piavatar_envs.sim.time_step import choose_substeps
+from piavatar_envs.sim.time_step import choose_substeps, reference_substeps
 
 
 class Simulation:
@@ -182,15 +182,16 @@ class Simulation:
         wave, limiting = fastest_wave(config.randomize, matter), limiting_wave(config.randomize, matter, self.dx)
         viscous = physics.cfl / CFL_STABLE * max(limiting, subjects.matter.limiting_speed(self.dx))
         fastest = max(wave, subjects.matter.sound_speed(), viscous)
+        cloth = float(self._shells.wave.max()) if self._shells else 0.0
+        bounds = config, self.scene, self.domain, self.flesh, self._solids, largest_impulses, self.dx
         self.model = build_model(
             subjects.matter,
             make_grid(self.domain.lower, self.domain.upper, self.dx),
             num_envs=self.num_envs,
             device=self.device,
             control_dt=physics.control_dt,
-            num_substeps=choose_substeps(
-                config, self.scene, self.domain, self.flesh, self._solids, largest_impulses, self.dx, fastest
-            ),
+            num_substeps=choose_substeps(*bounds, fastest),
+            reference_substeps=reference_substeps(*bounds, max(wave, cloth)),
             cfl=physics.cfl,
             gravity=(0.0, 0.0, -physics.gravity),
             decoupling=physics.decoupling,

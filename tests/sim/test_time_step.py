@@ -11,6 +11,7 @@ import pytest
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.mpm.model import choose_num_substeps
+from piavatar_envs.mpm.retention import retained_share
 from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.sim.time_step import STRUCK, lever
 from piavatar_envs.sim.world import Simulation
@@ -43,6 +44,21 @@ def test_no_default_has_other_substeps_than_its_waves_ask_for(device):
         model, physics = simulation.model, task.config.physics
         wave = choose_num_substeps(physics.control_dt, simulation.dx, model.sound_speed, physics.cfl)
         assert model.num_substeps == wave, cls.__name__
+        assert model.retained_share is None, cls.__name__
+
+
+@pytest.mark.parametrize("fidelity", ["tiny", "coarse"])
+def test_substeps_beyond_those_of_the_flesh_keep_its_damping(device, fidelity):
+    far = {"name": "far", "size": [0.1], "density": 1000.0, "position": [-1.2, -1.2, 1.2]}
+    usual = world(device, fidelity=fidelity, scene={"props": [far]}).model
+    assert usual.retained_share is None
+    stiff = {"scene": {"props": [far | {"young_modulus": 1e6}]}}
+    for more in ({"num_substeps": 2 * usual.num_substeps}, {"cfl": 0.25}, {"damping_ratio": 0.5}, stiff):
+        model = world(device, fidelity=fidelity, **more).model
+        share = retained_share(model.num_substeps / usual.num_substeps)
+        assert share > 0.05
+        assert model.retained_share.numpy() == pytest.approx(share), more
+    assert world(device, fidelity=fidelity, num_substeps=usual.num_substeps).model.retained_share is None
 
 
 def test_a_chain_of_joints_adds_up_what_they_are_from_its_end():

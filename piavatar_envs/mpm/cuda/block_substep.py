@@ -165,10 +165,11 @@ def reset_speeds(arena: Arena):
     arena.speed[e, f] = 0.0
 
 
-def record_in_block(graph: LaunchGraph, model: Model, state: State, scratch: Scratch, moving: Moving) -> None:
-    """Append the substep: all of it with a single field, else up to contact."""
+def record_in_block(
+    graph: LaunchGraph, model: Model, state: State, scratch: Scratch, moving: Moving, with_g2p: bool
+) -> None:
+    """Append the substep: all of it if ``with_g2p``, which takes a single field, else up to contact."""
     threads = LARGE_THREADS if scratch.large_arena else SMALL_THREADS
-    with_g2p = model.contact.num_fields == 1
     graph.launch(
         substep_kernel(scratch.large_arena, with_g2p),
         (model.num_envs, scratch.arena.partition.shape[0] * threads),
