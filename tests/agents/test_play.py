@@ -158,7 +158,7 @@ def test_a_policy_of_rllib_plays_without_it(tmp_path, device):
     action = run.make_agent(batch.layout, batch.action_size)(seen)
     hidden = np.tanh(seen[:, 0, batch.layout["target_position"].slice] @ first.T + 1.0)
     np.testing.assert_allclose(action[:, 0], np.clip(hidden @ second.T, -1.0, 1.0), atol=1e-5)
-    with pytest.raises(ConfigError, match="policy.pt holds no policy of its config.yaml that sees 3 numbers"):
+    with pytest.raises(ConfigError, match=r"policy\.pt holds no policy of its config\.yaml that sees 3 numbers"):
         run.make_agent(batch.layout, batch.action_size + 1)
 
 

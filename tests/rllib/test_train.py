@@ -68,7 +68,7 @@ def test_a_trained_policy_plays_as_in_training(tmp_path):
         (tmp_path / left).unlink()
     train.main([str(game), *TINY, "iterations=1", "--out", str(tmp_path / "game")])
     for left in ("policy.pt", "checkpoint.pt"):
-        with pytest.raises(SystemExit, match="high_five_v0.* is a world of several agents"):
+        with pytest.raises(SystemExit, match=r"high_five_v0.* is a world of several agents"):
             play.main([str(tmp_path / "game")])
         (tmp_path / "game" / left).unlink()
 
