@@ -216,9 +216,9 @@ def prepare(env_id: str, config: tuple[str, ...], avatar: Path | None = None) ->
     overrides = parse_assignments(config)
     if avatar is not None:
         from piavatar_envs.avatar.body.sources import source_of
+        from piavatar_envs.core.reading import check_file
 
-        if not avatar.exists():
-            raise FileNotFoundError(f"there is no file {avatar}")
+        check_file(avatar)
         overrides = {"avatar.source": source_of(avatar), "avatar.path": str(avatar), **overrides}
     doctor.quiet_warp()
     return overrides

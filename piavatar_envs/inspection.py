@@ -24,6 +24,7 @@ from piavatar_envs.avatar.gltf import Gltf, read_gltf
 from piavatar_envs.avatar.motion.library import load_motion
 from piavatar_envs.config.schema import PhysicsConfig
 from piavatar_envs.core.extras import missing
+from piavatar_envs.core.reading import check_file
 from piavatar_envs.core.writing import check_writable
 
 #: Endings of files of glTF, which may hold a character, motions or both.
@@ -52,8 +53,7 @@ def examine(path: Path, settings: Mapping[str, Any] | None = None, picture: Path
         ImportError: the extra of pictures is not installed.
     """
     settings = dict(settings or {})
-    if not path.is_file():
-        raise FileNotFoundError(f"no file {path}")
+    check_file(path)
     if picture is not None:
         check_writable(picture)
     suffix = path.suffix.lower()

@@ -84,7 +84,7 @@ def test_the_file_of_an_avatar_chooses_its_source(probe, tmp_path, capsys):
     given = {name: value for name, value in probe[0].settings.items() if name.startswith("avatar")}
     assert given == {"avatar.source": "mesh", "avatar.path": str(file), "avatar.height": 1.7}
     capsys.readouterr()
-    for name, message in (("none.glb", "there is no file"), ("a.xyz", "no avatar source reads")):
+    for name, message in (("none.glb", "no file"), (".", "is a folder"), ("a.xyz", "no avatar source reads")):
         (tmp_path / "a.xyz").touch()
         with pytest.raises(SystemExit):
             cli.main(["play", PROBE, "--avatar", str(tmp_path / name)])

@@ -108,6 +108,8 @@ def test_unknown_settings_and_files_are_refused(knight, tmp_path):
         inspection.examine(knight, {"tall": 2})
     with pytest.raises(FileNotFoundError):
         inspection.examine(tmp_path / "none.glb")
+    with pytest.raises(ValueError, match="is a folder"):
+        inspection.examine(tmp_path)
 
 
 def test_the_example_character_has_hair_of_its_body_and_a_worn_skirt(tmp_path):

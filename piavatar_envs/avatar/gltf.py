@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import check_file, reading
 
 MAX_FILE = 2**31  # [bytes] of the file, and of a buffer beside it
 MAX_JSON = 2_000_000  # brackets and commas of the document, which may hold long strings of data
@@ -566,8 +566,7 @@ def read_gltf(path: str | Path) -> Gltf:
         ValueError: it is damaged, of another format, or requires an extension that is not read.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no file {path}")
+    check_file(path)
     with reading(path, "a glTF file that can be read"):
         if path.stat().st_size > MAX_FILE:
             raise ValueError(f"it has {path.stat().st_size} bytes, more than {MAX_FILE}")

@@ -43,6 +43,19 @@ def files_behind(path: Path) -> list[Path]:
     return found
 
 
+def check_file(path: Path) -> None:
+    """Refuse a path at which there is no file.
+
+    Raises:
+        FileNotFoundError: there is nothing.
+        ValueError: there is a folder.
+    """
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; give the path of a file in it")
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}")
+
+
 def first_line(error: Exception) -> str:
     """Return the first line of an error's message after the error's name, which alone says what a KeyError is."""
     lines = str(error).strip().splitlines()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import time
 import tracemalloc
@@ -242,3 +243,21 @@ def test_characters_wrestle(knight, device):
         observations, *_ = game.step({agent: game.action_space(agent).sample() for agent in game.agents})
         assert len(observations) == 2 and all(np.isfinite(values).all() for values in observations.values())
     game.close()
+
+
+def test_a_second_figure_is_left_out(asset, standing, tmp_path):
+    out = rig_of(asset, named("mixamo")).write()
+    document, count = out.document, len(out.document["nodes"])
+    others = copy.deepcopy(document["nodes"])
+    for node in others:
+        node["children"] = [child + count for child in node.get("children", [])]
+    others[0]["matrix"] = (
+        np.block([[np.eye(3), np.array([[1.5], [0.0], [0.0]])], [0.0, 0.0, 0.0, 1.0]]).T.ravel().tolist()
+    )
+    others[-1] |= {"name": "Other", "skin": 1}
+    document["nodes"] += others
+    document["skins"].append(document["skins"][0] | {"joints": [j + count for j in document["skins"][0]["joints"]]})
+    document["scenes"][0]["nodes"] += [root + count for root in document["scenes"][0]["nodes"]]
+    character = read_character(out.save(tmp_path / "two.glb"))
+    assert character.notes == ("left out, for they belong to another skeleton: Other",)
+    np.testing.assert_allclose(character.vertices, standing[1], atol=1e-6)

@@ -71,6 +71,8 @@ VRM_JOINTS: dict[str, str] = {
 }  # fmt: skip
 _VRM_SPINE = ("spine", "chest", "upperChest")
 _SPINE_JOINTS = ("spine1", "spine2", "spine3")
+#: A node farther than this from the joint that it is a copy of, over the way from the pelvis to the head, is another's.
+_OWN_REACH = 0.5
 #: Places of the embedded body's joints, as shares of the way from the pelvis over the spine to the head.
 TRUNK_SHARES = {"pelvis": 0.0, "spine1": 0.19, "spine2": 0.37, "spine3": 0.59, "neck": 0.91, "head": 1.0}
 COLLAR_SHARE = 0.35  # of the way from the neck to the shoulder
@@ -226,6 +228,30 @@ def owner_of_nodes(joint_map: JointMap, parents: Sequence[int]) -> np.ndarray:
     for node in range(len(parents)):
         owners[node] = next((own[above] for above in _upwards(node, parents) if above in own), 0)
     return owners
+
+
+def of_rig(joint_map: JointMap, parents: Sequence[int], positions: np.ndarray) -> np.ndarray:
+    """Return which nodes belong to the rig of a character, and not to another one with the same names.
+
+    Args:
+        joint_map: of the rig.
+        parents: of the nodes.
+        positions: of the nodes, shape ``(N, 3)``.
+
+    Returns:
+        Whether each node is below or above a joint, or another node for a joint that is near it, shape ``(N,)`` bool.
+    """
+    rest, nodes = np.asarray(positions, dtype=np.float64), joint_map.nodes
+    near = _OWN_REACH * np.linalg.norm(rest[nodes["head"]] - rest[nodes["pelvis"]])
+    also = {
+        node
+        for node, joint in joint_map.aliases.items()
+        if joint not in nodes or np.linalg.norm(rest[node] - rest[nodes[joint]]) <= near
+    }
+    own = {*nodes.values(), *also}
+    above = {node for joint in own for node in _upwards(joint, parents)}
+    chains = (_upwards(node, parents) for node in range(len(parents)))
+    return np.array([node in above or any(each in own for each in chain) for node, chain in enumerate(chains)], bool)
 
 
 def axes_of(joint_map: JointMap, positions: np.ndarray, tips: np.ndarray | None = None) -> tuple[np.ndarray, bool]:

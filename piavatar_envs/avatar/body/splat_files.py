@@ -26,7 +26,7 @@ from scipy.special import expit, logit
 from piavatar_envs.avatar.body.splats import COEFFICIENTS, SplatCloud
 from piavatar_envs.avatar.gltf import Gltf, read_gltf, whole
 from piavatar_envs.core.extras import missing
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import check_file, reading
 
 #: Endings of the files that are read.
 SUFFIXES = (".ply", ".spz", ".glb", ".gltf")
@@ -62,8 +62,7 @@ def read_splats(path: str | Path) -> SplatCloud:
     readers = {".ply": _read_ply, ".spz": _read_spz, ".glb": _read_gltf, ".gltf": _read_gltf}
     if path.suffix.lower() not in readers:
         raise ValueError(f"{path} is no file of splats by its ending; use one of {', '.join(SUFFIXES)}")
-    if not path.is_file():
-        raise FileNotFoundError(f"no file {path}")
+    check_file(path)
     with reading(path, "a file of Gaussian splats"):
         return readers[path.suffix.lower()](path)
 

@@ -20,6 +20,7 @@ from piavatar_envs.avatar.body.rigs import (
     axes_of,
     joints_of,
     map_joints,
+    of_rig,
     owner_of_nodes,
     read_mapping,
 )
@@ -73,11 +74,18 @@ def read_character(path: str | Path, height: float | None = None, mapping: str |
     rest = surfaces.world[:, :3, 3]
     joint_map = _rig(gltf, rest, mapping)
     owners = owner_of_nodes(joint_map, gltf.parents)
-    kept = _kept(gltf, surfaces)
+    hanging, own = _hanging(gltf, surfaces), of_rig(joint_map, gltf.parents, rest)
+    kept = [i for i in hanging if own[surfaces.pieces[i].nodes[surfaces.pieces[i].weights > 0.0]].any()]
     notes = [*surfaces.notes, *joint_map.notes]
-    if len(kept) < len(surfaces.pieces):
-        names = {piece.name for i, piece in enumerate(surfaces.pieces) if i not in kept}
-        notes.append(f"left out, for they hang on no bone: {', '.join(sorted(names))[:200]}")
+    for some, left, why in (
+        (range(len(surfaces.pieces)), hanging, "they hang on no bone"),
+        (hanging, kept, "they belong to another skeleton"),
+    ):
+        if names := {surfaces.pieces[i].name for i in some if i not in left}:
+            notes.append(f"left out, for {why}: {', '.join(sorted(names))[:200]}")
+    if not any(surfaces.pieces[i].skin is not None for i in kept):
+        pelvis = gltf.names[joint_map.nodes["pelvis"]]
+        raise ValueError(f"{path}: no mesh is skinned to the skeleton of {pelvis!r}; export one figure with its own")
     places = np.concatenate([surfaces.places[index] for index in kept])
     weights = np.concatenate([_weights(surfaces, index, owners) for index in kept])
     skinned = np.concatenate([np.full(len(surfaces.places[i]), surfaces.pieces[i].skin is not None) for i in kept])
@@ -185,7 +193,7 @@ def _of_file(path: str | Path) -> Iterator[None]:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _kept(gltf: Gltf, surfaces: Surfaces) -> list[int]:
+def _hanging(gltf: Gltf, surfaces: Surfaces) -> list[int]:
     """Return indices of the pieces that are skinned or hang on a bone."""
     bones = {int(joint) for skin in gltf.skins for joint in skin.joints}
     on_bone = np.zeros(len(gltf.parents), bool)

@@ -20,7 +20,7 @@ from piavatar_envs.avatar.body.textures import Texture, Textures, joined, reduce
 from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.avatar.gltf_surfaces import read_surfaces
 from piavatar_envs.core.extras import missing
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import check_file, reading
 from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Endings of files that only this source reads.
@@ -110,8 +110,7 @@ def load_surface(path: Path) -> _Loaded:
     """Return the surface of a file."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(FORMATS)}")
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
+    check_file(path)
     loaded = (_load_gltf if path.suffix.lower() in _GLTF else _load_other)(path)
     if not len(loaded.faces):
         raise ValueError(
