@@ -16,7 +16,7 @@ from agents import files
 from benchmarks import runner
 from benchmarks.paper import acts, disturbance, figures, measures, supplement, tracking
 from benchmarks.paper.stage import Act, keyed, perform
-from benchmarks.physics import blows, contact, elastodynamics, sources, stability, torque, wear
+from benchmarks.physics import blows, contact, elastodynamics, regions, sources, stability, torque, wear
 from benchmarks.physics.limbs import Options
 from benchmarks.physics.rig import Rig, World
 from benchmarks.speed import cpu, failures, pixels, plain_mpm, profile, soak, steps, vector
@@ -27,6 +27,7 @@ from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import FAILURE_CFL
 from piavatar_envs.tasks import task_modules
+from scripts.synthetic_character import character
 
 
 def run(module: ModuleType, path: Path, device: str, *arguments: str) -> list[dict]:
@@ -60,6 +61,14 @@ def test_avatars_of_a_source_act_at_random(tmp_path, device):
     ]
     chosen = ("avatar.source=gaussian", "avatar.path=a.glb")
     assert sources.settings_of("a.glb#gaussian") == ("gaussian", chosen)
+
+
+def test_a_can_dents_soft_hair_more(tmp_path, device):
+    hero = character(thick=True).save(tmp_path / "hero.glb")
+    rows = run(regions, tmp_path / "regions.json", device, str(hero), "--fidelity", "tiny")
+    check_finite(rows)
+    dents = {(row["site"], row["material"]): row["peak_dent_mm"] for row in rows}
+    assert len(dents) == 6 and dents["hair", "region"] > 2.0 * dents["hair", "flesh"]
 
 
 def test_vector_rates_are_consistent(tmp_path, device):
