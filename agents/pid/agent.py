@@ -160,7 +160,7 @@ class PIDAgent:
         size = self.bones.mass.sum() * np.ptp(points.rest[0][:, 2]) / (REFERENCE_MASS * REFERENCE_HEIGHT)
         muscles = make_muscles(strength=env.config.control.strength)
         self.lower, self.upper = size * muscles.lower, size * muscles.upper
-        self.tissue = Tissue(size, env.simulation.flesh[0].torque_control().flesh_stiffness)
+        self.tissue = Tissue(size, env.simulation.flesh[0].torque_control().tissue.flesh)
         self._tissue_damping = size * muscles.tissue_damping
         self.balance = self._balance()
         self.poses = poses

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.physics.checks import Options, Quantity, at_most, check, equal
-from benchmarks.physics.probe import EMPTY, GRAVITY, Probe
+from benchmarks.physics.probe import EMPTY, GRAVITY, JOINTS, Probe
 from piavatar_envs.avatar.body.muscles import LOCKED_JOINTS, make_muscles
 from piavatar_envs.avatar.body.skeleton import BEYOND, JOINT_NAMES, PARENTS, joint_index
 from piavatar_envs.avatar.torque_control.joint_tissue import RETARDATION_TIME
@@ -49,7 +49,10 @@ LIFTS = {
 
 
 def stiffness(options: Options, control: str, lift: Lift) -> Iterator[Quantity]:
-    """Bend a joint by a box; compare moment over angle with the table's spring, and under pd the tissue beside it."""
+    """Bend a joint by a box; compare moment over angle with the table's spring, and under pd the tissue beside it.
+
+    Where joints resist under pose control, the root's rigid field carries its share of what is beyond the joint.
+    """
     velocity = [LIFT_SPEED * part for part in lift.direction]
     box = {"name": "box", "kind": "box", "size": list(lift.half), "position": list(lift.center)}
     scene = {"ground": False, "colliders": [box | {"velocity": velocity, "friction": 0.0}]}
@@ -60,6 +63,8 @@ def stiffness(options: Options, control: str, lift: Lift) -> Iterator[Quantity]:
     probe.run(SETTLING)
     force, moment = (probe.sensor(f"boundary_{name}")[0] / probe.dt for name in ("impulse", "moment"))
     about = moment - np.cross(probe.pose[1][joint_index(lift.joint)], force)
+    if control == JOINTS:
+        about = about + moment_about(probe, lift.joint, root_forces(probe))
     angle = float(np.linalg.norm(probe.errors[joint_index(lift.joint)]))
     wanted = probe.spring(lift.joint)
     if control == "pd":
@@ -68,11 +73,16 @@ def stiffness(options: Options, control: str, lift: Lift) -> Iterator[Quantity]:
     yield equal(f"stiffness of the {lift.joint.removeprefix('left_')}", measured, wanted, 0.1 * wanted, "N m/rad")
 
 
+def key_of(control: str) -> str:
+    """Return the end of the names of checks of a control."""
+    return control.replace(", ", "_")
+
+
 def _register_lifts() -> None:
-    for control in ("pose", "pd"):
+    for control in ("pose", JOINTS, "pd"):
         for name, lift in LIFTS.items():
             title = f"box rises against a limb, {name} ({control})"
-            check(f"stiffness_{name}_{control}", title)(partial(stiffness, control=control, lift=lift))
+            check(f"stiffness_{name}_{key_of(control)}", title)(partial(stiffness, control=control, lift=lift))
 
 
 _register_lifts()
@@ -82,6 +92,15 @@ def moment_about(probe: Probe, joint: str, force: np.ndarray) -> np.ndarray:
     """Return the moment [N m] about a joint of forces on the particles beyond it, shape ``(P, 3)`` [N]."""
     share = probe.shares[:, BEYOND[joint_index(joint)]].sum(1, keepdims=True)
     return np.cross(probe.x[probe.body] - probe.pose[1][joint_index(joint)], share * force).sum(0)
+
+
+def root_forces(probe: Probe) -> np.ndarray:
+    """Return the root's force on every particle in the last control step [N], ``(P, 3)``: a rigid acceleration."""
+    state, body = probe.simulation.avatar.state, probe.body
+    mass, arm = probe.mass[body], probe.x[body] - probe.center(body)
+    force, torque = (array.numpy()[0].astype(float) for array in (state.wrench_force, state.wrench_torque))
+    inertia = (mass * (arm**2).sum(1)).sum() * np.eye(3) - (mass[:, None] * arm).T @ arm
+    return mass[:, None] * (force / mass.sum() + np.cross(np.linalg.solve(inertia, torque), arm))
 
 
 def joint_moment(probe: Probe, joint: str) -> np.ndarray:
@@ -116,16 +135,22 @@ def force_foot(options: Options) -> Iterator[Quantity]:
         yield equal(label, joint_moment(probe, name)[0], theory, max(0.02, 0.02 * abs(theory)), "N m")
 
 
-@check("force_hand", "20 N pull a hand of a held, weightless body down (pose)")
-def force_hand(options: Options) -> Iterator[Quantity]:
+def force_hand(options: Options, control: str) -> Iterator[Quantity]:
     """Compare the error of each joint of the arm under tone 1 with the moment of the force over the table's spring."""
-    probe, force = Probe.under(options, "pose", **EMPTY), np.array([0.0, 0.0, -20.0])
+    probe, force = Probe.under(options, control, **EMPTY), np.array([0.0, 0.0, -20.0])
     at = push(probe, "left_wrist", force, SETTLING)
     for name in ("left_wrist", "left_elbow", "left_shoulder"):
         moment = np.linalg.norm(np.cross(at(probe) - probe.pose[1][joint_index(name)], force))
         wanted = np.degrees(moment / probe.spring(name))
         error = np.degrees(np.linalg.norm(probe.errors[joint_index(name)]))
         yield equal(f"angle of the {name.removeprefix('left_')}", error, wanted, 0.15 * wanted + 0.1, "deg")
+
+
+for _control in ("pose", JOINTS):
+    _name = "force_hand" if _control == "pose" else f"force_hand_{key_of(_control)}"
+    check(_name, f"20 N pull a hand of a held, weightless body down ({_control})")(
+        partial(force_hand, control=_control)
+    )
 
 
 def push(
@@ -205,10 +230,9 @@ def impulse_foot(options: Options) -> Iterator[Quantity]:
     yield equal("angle of the ankle about x after 50 ms", turned, theory, 0.1 * abs(theory), "deg")
 
 
-@check("legs_pressed", "legs pressed together and opened, self-contact (pose)")
-def legs_pressed(options: Options) -> Iterator[Quantity]:
+def legs_pressed(options: Options, control: str) -> Iterator[Quantity]:
     """Press the legs together by 28 degrees each and open them again: after 4 s no joint is bent any more."""
-    probe = Probe.of(options, "Reach", scene={"ground": False, "self_contact": True})
+    probe = Probe.under(options, control, scene={"ground": False, "self_contact": True})
     names, closed = probe.env.action_names, np.zeros((len(JOINT_NAMES), 3))
     for side, sign in (("left", 1.0), ("right", -1.0)):
         closed[joint_index(f"{side}_hip"), 1] = sign * np.radians(28.0)
@@ -226,6 +250,13 @@ def legs_pressed(options: Options) -> Iterator[Quantity]:
     errors = np.degrees(np.linalg.norm(probe.errors, axis=1))[1:]
     worst = JOINT_NAMES[1 + int(errors.argmax())].replace("_", " ")
     yield replace(at_most("largest error of a joint 4 s later", errors.max(), 1.0, "deg", theory=0.0), note=worst)
+
+
+for _control in ("pose", JOINTS):
+    _name = "legs_pressed" if _control == "pose" else f"legs_pressed_{key_of(_control)}"
+    check(_name, f"legs pressed together and opened, self-contact ({_control})")(
+        partial(legs_pressed, control=_control)
+    )
 
 
 def kick(action: np.ndarray, step: int, _rng: np.random.Generator) -> None:
@@ -249,6 +280,9 @@ MOTIONS: dict[str, tuple[str, dict, Callable[[np.ndarray, int, np.random.Generat
     "random": ("KickBall", {"bound_motion": True}, full_scale, 25),
     "root": ("TrackMotion", {"motion": "t_pose", "impulse": 0.0, "bound_motion": True}, jerk_root, 6),
     "pd": ("Stand", {"control": "pd", "root_assist": 0.0}, full_scale, 25),
+    "kick_pose_joints": ("Reach", {"resistance": "joints"}, kick, 10),
+    "random_pose_joints": ("KickBall", {"resistance": "joints", "bound_motion": True}, full_scale, 25),
+    "free_pose_joints": ("Reach", {"resistance": "joints", "root": "free"}, full_scale, 25),
 }
 
 
@@ -280,6 +314,9 @@ MOTION_TITLES = {
     "random": "random full-scale actions in KickBall (pose)",
     "root": "root commanded from 0 to full speed in a step (pose)",
     "pd": "random full-scale targets (pd, unassisted)",
+    "kick_pose_joints": f"one leg kicks at full speed ({JOINTS})",
+    "random_pose_joints": f"random full-scale actions in KickBall ({JOINTS})",
+    "free_pose_joints": f"random full-scale actions, nothing holds the root ({JOINTS})",
 }
 for _name, _title in MOTION_TITLES.items():
     check(f"root_force_{_name}", _title)(partial(momentum_balance, motion=_name))

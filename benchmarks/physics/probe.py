@@ -24,6 +24,8 @@ from piavatar_envs.sim.world import Simulation
 #: Empty space: settings of a scene in which nothing weighs anything.
 EMPTY: dict[str, Any] = {"gravity": 0.0, "scene": {"ground": False}}
 GRAVITY = 9.81
+#: Pose control in which joints resist contact.
+JOINTS = "pose, joints"
 #: Middles of chest and head, x and z [m].
 CHEST, HEAD = (0.0, 1.28), (0.0, 1.55)
 #: Greatest volume fraction of a particle at the surface of a body, over the median of the body's.
@@ -181,7 +183,7 @@ class Measurements:
     @cached_property
     def tissue(self) -> Tissue:
         """Tissue of the joints of this body."""
-        return Tissue(self.size, self.simulation.flesh[0].torque_control().flesh_stiffness)
+        return Tissue(self.size, self.simulation.flesh[0].torque_control().tissue.flesh)
 
     def sensor(self, name: str) -> np.ndarray:
         """Return a contact sensor of the last control step."""
@@ -231,9 +233,12 @@ class Probe(Measurements):
 
     @classmethod
     def under(cls, options: Options, control: str, held: bool = True, **settings: Any) -> Probe:
-        """Build a body that stands under ``control``; ``held`` says whether its pelvis is."""
+        """Build a body that stands under ``control``, or :data:`JOINTS`; ``held`` says whether its pelvis is."""
         if control == "pose":
             return cls.of(options, "Reach", **({"root": "wrench" if held else "free"} | settings))
+        if control == JOINTS:
+            joints = {"mode": "pose", "resistance": "joints", "root": "wrench" if held else "free"}
+            return cls.of(options, "Stand", control=joints, pose_noise=0.0, **settings)
         return cls.of(options, "Stand", control=control, root_assist=float(held), pose_noise=0.0, **settings)
 
     def step(self, action: np.ndarray | None = None) -> dict[str, Any]:

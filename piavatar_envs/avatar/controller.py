@@ -8,7 +8,7 @@ Shape, tone, root and flesh are pulled as by springs that are critically damped 
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import warp as wp
 
@@ -27,6 +27,11 @@ class Controller(Protocol):
     @property
     def moves_particles(self) -> bool:
         """Return whether :meth:`record_end` moves particles: it must then wait for the sensors of the control step."""
+        ...
+
+    @property
+    def joints(self) -> Any:
+        """Return the articulated body that takes the forces on bones; None where flesh takes them."""
         ...
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:

@@ -199,6 +199,11 @@ class PoseControlConfig(BaseModel):
         le=1.0,
         description="how firmly joints return to the commanded pose after contact: 0 limp, 1 tensed [-]",
     )
+    resistance: Literal["flesh", "joints"] = Field(
+        "flesh",
+        description="what resists contact: flesh (pulls on its particles, an acceleration that light limbs hardly "
+        "resist by) or joints (springs of the table of muscles times tone, as under pd)",
+    )
     alpha: float = Field(0.3, ge=0.0, le=1.0, description="shape preservation, as a share of a control step [-]")
     shape_preservation: Literal["physical", "kinematic"] = Field(
         "physical",

@@ -19,12 +19,15 @@ from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
 from piavatar_envs.avatar.body.flesh_stiffness import kept_stiffness
 from piavatar_envs.avatar.body.groups import flesh_of
-from piavatar_envs.avatar.body.muscles import make_muscles
+from piavatar_envs.avatar.body.muscles import LOCKED_JOINTS, Muscles, make_muscles
+from piavatar_envs.avatar.body.passive import passive_moments
 from piavatar_envs.avatar.body.pose_correctives import COARSEST, pose_correctives
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
-from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_JOINTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import TorqueControl
+from piavatar_envs.avatar.torque_control.joint_tissue import JointTissue
+from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED
 from piavatar_envs.avatar.types import COMMANDS, DAMPING, ROOT_RATE, TONE_RATE, PoseControl
 from piavatar_envs.config import (
     AvatarConfig,
@@ -44,6 +47,8 @@ from piavatar_envs.mpm.types import Model
 NUM_PARTS = len(BODY_PARTS)
 #: Gravity in which force limits in body weights are counted [m/s^2].
 STANDARD_GRAVITY = 9.81
+#: Rate of the pull that holds flesh at the bone where joints resist under pose control [1/s].
+BONE_RATE = 1000.0
 #: First number of the seeds of a pool's shapes.
 POOL_SEED = 20_260
 #: Arrays of :class:`~piavatar_envs.avatar.body.device.BodyPoints` that depend on the shape.
@@ -185,43 +190,89 @@ class Flesh:
         return Bodies(parameters, {name: np.concatenate(rows).astype(np.float32) for name, rows in found.items()})
 
     def torque_control(self) -> TorqueControl | None:
-        """Return the parameters of torque control; None under pose control.
+        """Return the parameters of joints that move or resist by torques; None where flesh alone resists.
 
         Raises:
-            ConfigError: torque control or a held root with a decoupling of one velocity.
+            ConfigError: torque control, joints that resist, or a held root with a decoupling of one velocity; settings
+                that have no effect where joints resist.
         """
         control = self.control
-        held = control.mode != "pose" or control.root != "free"
+        posed = isinstance(control, PoseControlConfig)
+        self._refuse_one_velocity()
+        if posed and control.resistance == "flesh":
+            return None
+        if posed:
+            self._refuse_what_joints_lack()
+            muscles, rates = make_muscles(), (control.alpha / self.physics.control_dt, BONE_RATE)
+            regions = [
+                None if region.alpha is None else (region.alpha / self.physics.control_dt, BONE_RATE)
+                for region in self.avatar.regions
+            ]
+        else:
+            muscles = make_muscles(control.joint_stiffness, control.joint_damping, control.strength)
+            rates, regions = control.flesh_rate, [region.flesh_rate for region in self.avatar.regions]
+        return TorqueControl(
+            muscles=muscles,
+            root_assist=0.0 if posed else control.root_assist,
+            flesh_rate=self._attachment(rates, regions),
+            firm_bones=(self.sampled.bone >= 0) & (posed or control.firm_bones),
+            links=self.sampled.links,
+            bone_contact=posed or control.bone_contact,
+            tissue=self._tissue(muscles),
+        )
+
+    def _refuse_one_velocity(self) -> None:
+        """Refuse control that needs two velocities with a decoupling of one."""
+        control = self.control
+        posed = isinstance(control, PoseControlConfig)
+        resists = posed and control.resistance == "joints"
+        held = not posed or resists or control.root != "free"
         if held and self.physics.decoupling in ("paper", "none"):
-            what = f"root={control.root!r}" if control.mode == "pose" else f"mode={control.mode!r}"
-            remedy = "split or no_stress" + (", or control.root=free" if control.mode == "pose" else "")
+            what = f"root={control.root!r}" if posed else f"mode={control.mode!r}"
+            remedy = "split or no_stress" + (", or control.root=free" if posed else "")
+            if resists:
+                what, remedy = "resistance='joints'", "split or no_stress, or control.resistance=flesh"
             raise ConfigError(
                 f"control.{what} needs two velocities: physics.decoupling={self.physics.decoupling!r} has one; use "
                 f"{remedy}"
             )
-        if control.mode == "pose":
-            return None
-        sampled = self.sampled
-        matter, points = self.matter(), self._points
+
+    def _refuse_what_joints_lack(self) -> None:
+        """Refuse settings of pose control that have no meaning where joints resist."""
+        control, lacking = self.control, "cannot be combined with control.resistance='joints'"
+        if control.command == "target":
+            raise ConfigError(f"control.command='target' {lacking}; use increment or reference")
+        if control.shape_preservation == "kinematic":
+            raise ConfigError(f"control.shape_preservation='kinematic' {lacking}; use physical")
+        if control.soft_tissue > 0.0 or any(region.soft_tissue for region in self.avatar.regions):
+            raise ConfigError(f"control.soft_tissue {lacking}; use 0")
+
+    def _tissue(self, muscles: Muscles) -> JointTissue:
+        """Return the passive resistance of the joints; under commanded motion, only their damping."""
+        control = self.control
+        locked = [joint_index(name) for name in LOCKED_JOINTS]
+        if isinstance(control, PoseControlConfig):
+            everywhere = np.full((NUM_JOINTS, 3), UNBOUNDED)
+            return JointTissue(muscles.tissue_damping, -everywhere, everywhere, locked)
+        sampled, matter, points = self.sampled, self.matter(), self._points
         mu, lam = lame_parameters(matter.young_modulus[0], matter.poisson_ratio[0])
         body = points.rest[0], self._volume[0], points.joints[0]
         stiffness = kept_stiffness(*body, sampled.links, sampled.skin_joints, sampled.skin_weights, mu, lam)
+        ranges = muscles.range_lower, muscles.range_upper
+        flesh = control.flesh_resistance * stiffness
+        return JointTissue(muscles.tissue_damping, *ranges, locked, passive_moments(), flesh)
+
+    def _attachment(self, whole: tuple[float, float], regions: list[tuple[float, float] | None]) -> np.ndarray:
+        """Return the rates of the pulls that hold flesh to bones [1/s], ``(P,)``, from those at skin and bone."""
+        sampled = self.sampled
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)
-        rates = attachment_rates(sampled.depth, distance, firm, *control.flesh_rate)
-        for region, inside in zip(self.avatar.regions, self._regions, strict=True):
-            if region.flesh_rate is not None:
-                own = attachment_rates(sampled.depth, distance, np.zeros(len(sampled)), *region.flesh_rate)
-                rates = np.where(inside, own, rates)
-        return TorqueControl(
-            muscles=make_muscles(control.joint_stiffness, control.joint_damping, control.strength),
-            root_assist=control.root_assist,
-            flesh_rate=rates,
-            firm_bones=(sampled.bone >= 0) & control.firm_bones,
-            links=sampled.links,
-            bone_contact=control.bone_contact,
-            flesh_stiffness=control.flesh_resistance * stiffness,
-        )
+        rates = attachment_rates(sampled.depth, distance, firm, *whole)
+        for own, inside in zip(regions, self._regions, strict=True):
+            if own is not None:
+                of_region = attachment_rates(sampled.depth, distance, np.zeros(len(sampled)), *own)
+                rates = np.where(inside, of_region, rates)
+        return rates
 
     def masses(self, volume: np.ndarray) -> np.ndarray:
         """Return nominal masses [kg] of particles of these volumes [m^3], shape ``(rows, P)``."""

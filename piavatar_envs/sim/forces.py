@@ -35,7 +35,6 @@ from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.segment_sums import moments_of
 from piavatar_envs.avatar.skinning import unpack
 from piavatar_envs.avatar.torque_control.bone_contact import moves_bone
-from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple
 from piavatar_envs.avatar.tracking import inertia_of, spin_of, summed_second_moment
 from piavatar_envs.avatar.types import Body, Pose
@@ -139,10 +138,10 @@ class Receivers:
 
     def __init__(self, avatars: Sequence[Avatar], controllers: Sequence[Controller], props: PropSet) -> None:
         self.avatars, self.controllers, self.props = tuple(avatars), tuple(controllers), props
-        self.jointed = [isinstance(controller, TorqueController) for controller in controllers]
+        self.jointed = [controller.joints is not None for controller in controllers]
         self.frames = {
             NUM_JOINTS * index: controller.joints.pose
-            if isinstance(controller, TorqueController)
+            if controller.joints is not None
             else make_struct(Pose, rotation=avatar.tracked.rotation, position=avatar.tracked.position)
             for index, (avatar, controller) in enumerate(zip(avatars, controllers, strict=True))
         }
@@ -237,7 +236,7 @@ class Forces:
         self._push = {
             index: controller.joints.allocate_push()
             for index, controller in enumerate(receivers.controllers)
-            if isinstance(controller, TorqueController)
+            if controller.joints is not None
         }
         count = receivers.first_prop + len(receivers.props)
         self._targets = list_targets(*receivers.weights(model.num_particles), count, device)

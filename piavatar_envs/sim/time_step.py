@@ -18,6 +18,7 @@ from piavatar_envs.config import (
     PhysicsConfig,
     PropConfig,
     SceneConfig,
+    TorqueControlConfig,
 )
 from piavatar_envs.config.schema import MOST_SUBSTEPS, select_joints
 from piavatar_envs.mpm.model import choose_num_substeps
@@ -65,7 +66,7 @@ def choose_substeps(
     """
     physics = config.physics
     mode, given = config.control.mode, physics.num_substeps
-    least = _least(config)
+    least = _least(config, flesh)
     if given is None:
         return max(least, _fewest(physics, dx, wave, _moving_speed(config, scene, domain, flesh, solids, impulses)))
     thing = fastest_thing(scene, solids, domain, physics.gravity)
@@ -102,7 +103,7 @@ def reference_substeps(
     arguments are those of :func:`choose_substeps`.
     """
     speed = max(wave, USUAL_CFL * _moving_speed(config, scene, domain, flesh, solids, impulses))
-    return max(_least(config), choose_num_substeps(config.physics.control_dt, dx, speed, USUAL_CFL))
+    return max(_least(config, flesh), choose_num_substeps(config.physics.control_dt, dx, speed, USUAL_CFL))
 
 
 def _moving_speed(
@@ -119,9 +120,10 @@ def _moving_speed(
     return max(commanded_speed(config.control, select_joints(config.joints), flesh), STRUCK * thing[1], blow[1])
 
 
-def _least(config: EnvConfig) -> int:
+def _least(config: EnvConfig, flesh: Sequence[Flesh]) -> int:
     """Return the fewest substeps that control takes."""
-    return 1 if config.control.mode == "pose" else math.ceil(config.physics.control_dt / LONGEST_SUBSTEP - 1e-9)
+    jointed = any(isinstance(one.control, TorqueControlConfig) or one.control.resistance == "joints" for one in flesh)
+    return math.ceil(config.physics.control_dt / LONGEST_SUBSTEP - 1e-9) if jointed else 1
 
 
 def _fewest(physics: PhysicsConfig, dx: float, wave: float, speed: float) -> int:

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.pose_control.controller import PoseController
+from piavatar_envs.avatar.pose_control.resistance import ResistingPoseController
 from piavatar_envs.config import replace
 from piavatar_envs.config.schema import UNCHANGED
 from piavatar_envs.sim.bodies import pose_control
@@ -66,6 +67,8 @@ class Tuning:
             return "garments have their own constant of gravity"
         if name == GRAVITY and value > self._built[name] and simulation.props:
             return "props that fall faster need a shorter time step"
+        if name == ALPHA and any(isinstance(own, ResistingPoseController) for own in simulation.controllers):
+            return "joints that resist have held their flesh by it from the start"
         if name == ALPHA and any(len(flesh.shape_rates(simulation.model)) for flesh in simulation.flesh):
             return "regions of the body have their own alpha"
         return None
@@ -123,7 +126,7 @@ class Tuning:
         """Set tone, alpha and gravity of the pose controllers."""
         simulation = self.simulation
         for flesh, controller in zip(simulation.flesh, simulation.controllers, strict=True):
-            if isinstance(controller, PoseController):
+            if isinstance(controller, PoseController | ResistingPoseController):
                 settings = {"tone": self.values[TONE], "alpha": self.values[ALPHA]}
                 control = flesh.control.model_copy(update=settings)
                 controller.parameters = pose_control(control, simulation.model)

@@ -16,7 +16,8 @@ from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.controller import Controller
 from piavatar_envs.avatar.pose_control.controller import PoseController
-from piavatar_envs.avatar.torque_control.controller import TorqueController
+from piavatar_envs.avatar.pose_control.resistance import ResistingPoseController
+from piavatar_envs.avatar.torque_control.controller import TorqueControl, TorqueController
 from piavatar_envs.config import AvatarConfig, EnvConfig, SceneConfig
 from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -212,14 +213,16 @@ class Simulation:
         self.avatars = [
             Avatar(flesh.points, begin, self.model) for flesh, begin in zip(self.flesh, first, strict=False)
         ]
-        self.controllers: list[Controller] = [
-            TorqueController(avatar, flesh.points, torque)
-            if torque
-            else PoseController(
-                avatar, flesh.points, pose_control(flesh.control, self.model), flesh.shape_rates(self.model)
-            )
-            for avatar, flesh, torque in zip(self.avatars, self.flesh, self._torque, strict=True)
-        ]
+        self.controllers = [self._control(*own) for own in zip(self.avatars, self.flesh, self._torque, strict=True)]
+
+    def _control(self, avatar: Avatar, flesh: Flesh, torque: TorqueControl | None) -> Controller:
+        """Return the controller of an avatar."""
+        if torque is not None and flesh.control.mode != "pose":
+            return TorqueController(avatar, flesh.points, torque)
+        parameters = pose_control(flesh.control, self.model)
+        if torque is not None:
+            return ResistingPoseController(avatar, flesh.points, parameters, torque)
+        return PoseController(avatar, flesh.points, parameters, flesh.shape_rates(self.model))
 
     def _build_props(self) -> None:
         """Allocate the props, whose subjects follow those of the avatars."""

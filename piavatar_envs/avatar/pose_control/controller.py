@@ -50,6 +50,8 @@ class PoseController:
 
     #: The end of a control step only takes over the command.
     moves_particles = False
+    #: Flesh takes the forces on bones.
+    joints = None
 
     def __init__(
         self, avatar: Avatar, points: BodyPoints, parameters: PoseControl, shape_rates: np.ndarray | None = None

@@ -73,17 +73,46 @@ def hold_root(
     # out
     wrench: Wrench,
 ):
-    """Compute the pull of the root, or release it beyond its limits; a control step begins without debt."""
+    """Run :func:`pull_root` for the pelvis of a kinematic pose that contact has carried."""
+    G = carry.rotation[e, 0]
+    q = G * pose.rotation[e, 0]
+    at = wp.quat_rotate(G, pose.position[e, 0]) + carry.translation[e, 0]
+    pull_root(
+        control, fraction, fraction == 0.0, command, q, at, whole.velocity[e], whole.spin[e], whole.inertia[e], mass, e,
+        root, wrench,
+    )  # fmt: skip
+
+
+@wp.func
+def pull_root(
+    control: PoseControl,
+    fraction: float,
+    begins: bool,
+    command: Command,
+    q: wp.quat,
+    at: wp.vec3,
+    velocity: wp.vec3,
+    spin: wp.vec3,
+    inertia: wp.mat33,
+    mass: float,
+    e: int,
+    # in and out
+    root: RootState,
+    # out
+    wrench: Wrench,
+):
+    """Compute the pull of the root, or release it beyond its limits; a control step ``begins`` without debt.
+
+    ``q`` and ``at`` are rotation and place of the pelvis when a ``fraction`` of the control step is over; velocity,
+    spin and inertia are those of the whole body.
+    """
     wrench.force[e] = wp.vec3(0.0)
     wrench.torque[e] = wp.vec3(0.0)
-    if fraction == 0.0:
+    if begins:
         wrench.owed[e] = wp.vec3(0.0)
         wrench.owed_turn[e] = wp.vec3(0.0)
     if control.root_rate <= 0.0:
         return
-    G = carry.rotation[e, 0]
-    q = G * pose.rotation[e, 0]
-    at = wp.quat_rotate(G, pose.position[e, 0]) + carry.translation[e, 0]
     q_command = command.rotation[e, 0] * quat_exp(fraction * command.increment[e, 0])
     error = command.root[e] + fraction * (command.goal_root[e] - command.root[e]) - at
     up = wp.vec3(0.0, 0.0, 1.0)
@@ -97,10 +126,10 @@ def hold_root(
         root.released[e] = 1
     if root.released[e] != 0:
         return
-    a = critical_pull(control.root_rate, control.dt, error, whole.velocity[e]) - control.gravity
-    turn = critical_pull(control.root_rate, control.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
+    a = critical_pull(control.root_rate, control.dt, error, velocity) - control.gravity
+    turn = critical_pull(control.root_rate, control.dt, quat_log(q_command * wp.quat_inverse(q)), spin)
     wrench.force[e] = clamp_length(mass * a, control.max_root_force * mass)
-    wrench.torque[e] = clamp_length(whole.inertia[e] * turn, control.max_root_torque * mass)
+    wrench.torque[e] = clamp_length(inertia * turn, control.max_root_torque * mass)
 
 
 @wp.func
@@ -150,10 +179,34 @@ def root_change(
     s = sum_threads6(vec8(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0), threads)
     P = wp.vec3(s[0], s[1], s[2]) - mass * removed.velocity[e]
     L = wp.vec3(s[3], s[4], s[5]) - removed.turning[e]
+    return answer_motion(
+        control, mass, whole.inertia[e], P, L, P + wrench.owed[e], L + wrench.owed_turn[e], e, thread, wrench, root
+    )
+
+
+@wp.func
+def answer_motion(
+    control: PoseControl,
+    mass: float,
+    inertia: wp.mat33,
+    P: wp.vec3,
+    L: wp.vec3,
+    need: wp.vec3,
+    need_turn: wp.vec3,
+    e: int,
+    thread: int,
+    # in and out
+    wrench: Wrench,
+    root: RootState,
+):
+    """Return the change of velocity and spin by the root where commanded motion has changed by ``P`` and ``L``.
+
+    These are a momentum [N s] and an angular momentum about the centre [N m s]. The root gives its pull, and what it
+    can of the impulses ``need`` and ``need_turn``; what it cannot give comes back to the body.
+    """
+    dt = control.dt
     force = wp.vec3()
     torque = wp.vec3()
-    need = P + wrench.owed[e]
-    need_turn = L + wrench.owed_turn[e]
     if root.released[e] == 0:
         force = dt * wrench.force[e]
         share = share_within(control, force, need, dt * mass * control.max_root_force)
@@ -164,7 +217,7 @@ def root_change(
         torque += share * need_turn
         need_turn *= 1.0 - share
     V = (force - P) / mass
-    W = spin_of(whole.inertia[e], torque - L)
+    W = spin_of(inertia, torque - L)
     if not (wp.isfinite(V) and wp.isfinite(W)):
         return wp.vec3(), wp.vec3()  # the MPM substep flags the failure
     if thread == 0:

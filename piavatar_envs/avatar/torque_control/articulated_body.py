@@ -94,13 +94,20 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.bone_hulls import BoneHulls
 from piavatar_envs.avatar.segment_sums import ALL_WORDS, PARTITION_THREADS, sum_moments, warps_of
 from piavatar_envs.avatar.torque_control.bone_contact import Ground
+from piavatar_envs.avatar.torque_control.commanded_motion import (
+    CommandedMotion,
+    aim_joints,
+    follow_command,
+    recoil,
+    split_commanded,
+)
 from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, find_places, put_in_place, split_velocity
 from piavatar_envs.avatar.torque_control.joint_tissue import JointTissue, make_tissue
 from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, Springs, Target, make_strength
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, MassMatrix, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
-from piavatar_envs.avatar.types import Body, JointState, Pose, allocate
+from piavatar_envs.avatar.types import Body, Command, JointState, Pose, allocate
 from piavatar_envs.core.cuda_intrinsics import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import make_struct
@@ -123,6 +130,7 @@ class ArticulatedBody:
         mass: the mass matrix.
         impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` of the pelvis springs.
         support: force and torque of the pelvis springs: every substep adds its share of a control step's mean.
+        motion: commanded motion, in whose frame the joints move; None until :meth:`follow`.
     """
 
     def __init__(
@@ -191,6 +199,8 @@ class ArticulatedBody:
         self._strain = None if links is None else MeasuredStrain(model, links, body.first, points.num_points)
         self._places = wp.zeros((n, 0 if links is None else points.num_points), dtype=wp.vec3, device=device)
         self._workspace = self._allocate()
+        self.motion: CommandedMotion | None = None
+        self._free = False
         without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
         self.set_strength(-everywhere, everywhere, 1)
         self.set_tissue(JointTissue(without[:, 0], -everywhere, everywhere, []))
@@ -228,6 +238,8 @@ class ArticulatedBody:
             muscle=NUM_DOF,
             left=NUM_DOF,
             push=rows(0, NUM_DOF),
+            reference=rows(0, NUM_DOF),
+            commanded=0,
         )
 
     def _upload(self, value: np.ndarray, dtype: type = float) -> wp.array:
@@ -251,6 +263,34 @@ class ArticulatedBody:
         """
         self._workspace.push = wp.zeros((self.model.num_envs, NUM_DOF), dtype=float, device=self.model.device)
         return self._workspace.push
+
+    def follow(self, command: Command, free: bool, released: wp.array) -> CommandedMotion:
+        """Let the joints move in the frame of a ``command``, and return its motion.
+
+        Launches recorded from now on read its increments. :attr:`JointState.velocity` is the deviation from it.
+
+        Args:
+            command: what is commanded in a control step.
+            free: whether nothing supports the body in any environment.
+            released: nonzero in the environments in which nothing supports it, ``(num_envs,)``.
+        """
+        n, device, count = self.model.num_envs, self.model.device, self.body.count
+        self._workspace.reference = wp.zeros((n, NUM_DOF), dtype=float, device=device)
+        self._workspace.commanded = wp.zeros((n, count), dtype=wp.vec3, device=device)
+        self.target.rotation = wp.zeros((n, NUM_JOINTS), dtype=wp.quat, device=device)  # of a substep
+        given = {"command": command, "change": count, "released": released, "momenta": 2, "recoil": 6}
+        self.motion, self._free = allocate(CommandedMotion, n, device, **given), free
+        return self.motion
+
+    @property
+    def commanded(self) -> wp.array:
+        """Return the commanded velocity of the particles in the last substep, ``(num_envs, num_points)`` [m/s]."""
+        return self._workspace.commanded
+
+    @property
+    def workspace(self) -> TorqueWorkspace:
+        """Return the arrays of a substep."""
+        return self._workspace
 
     def record_pose(self, graph: LaunchGraph, state: State) -> None:
         """Append the computation of the bones' places and motion, for joints that were not moved by a substep."""
@@ -294,15 +334,31 @@ class ArticulatedBody:
         model, w, fit = self.model, self._workspace, self.mass.is_due(step)
         if step == 0:
             self.record_pose(graph, state)
+        if self.motion is not None:
+            inputs = [step / model.num_substeps, 1.0 / model.control_dt, self.motion, state.failure]
+            graph.launch(aim_joints, (model.num_envs, NUM_JOINTS), inputs, [self.target.rotation, w])
         self._record_pull(graph, state, step / model.num_substeps)
         if fit:
             self._record_mass(graph, state)
         self._hulls.record(graph, self.pose, state.failure)
+        if self.motion is not None:
+            self._record_stage(graph, recoil, [self.body, int(self._free)], state, self.motion)
         inputs = [self.body, model.step.dt, 1.0 / model.control_dt, 3 if fit else 2]
         inputs += [self.target, self.springs, self.tissue, self.strength]
         self._record_stage(graph, act, inputs, state, self._ground(scratch), self.support)
-        inputs = [self.body, model.step.dt, (step + 1) / model.num_substeps, state.x, w, state.failure]
-        graph.launch(split_velocity, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
+        after = (step + 1) / model.num_substeps
+        if self.motion is None:
+            inputs = [self.body, model.step.dt, after, state.x, w, state.failure]
+            self.launch_over_points(graph, split_velocity, inputs, [state.u, state.kinematic])
+            return
+        inputs = [self.body, model.step.dt, 1.0 / model.num_substeps]
+        self._record_stage(graph, follow_command, inputs, state, self.motion)
+        inputs = [self.body, model.step.dt, step / model.num_substeps, after, state.x, state.failure]
+        self.launch_over_points(graph, split_commanded, inputs, [self.motion, w, state.u, state.kinematic])
+
+    def launch_over_points(self, graph: LaunchGraph, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        """Append a kernel whose threads share the particles of the body in every environment."""
+        graph.launch(kernel, self._points, inputs, outputs, block_dim=BLOCK)
 
     def _ground(self, scratch: Scratch) -> Ground:
         """Return the boundaries and sensors that bone contact uses."""
@@ -325,7 +381,8 @@ class ArticulatedBody:
         block = PARTITION_THREADS if self.threads > 1 else 1
         dim = (self.model.num_envs, self._partitions.start.shape[0] - 1, block)
         model = self.model
-        inputs = [self.body, self._partitions, model.step.dt, elapsed, 1.0 / model.control_dt, model.particles.mass]
+        per_time = 1.0 / model.control_dt if self.motion is None else 0.0  # commanded motion has corrections of its own
+        inputs = [self.body, self._partitions, model.step.dt, elapsed, per_time, model.particles.mass]
         inputs += [state.x, self.attachment, state.failure, self._scratch]
         graph.launch(
             attach_flesh, dim, inputs, [state.u, state.kinematic, self._workspace], block_dim=PARTITION_THREADS

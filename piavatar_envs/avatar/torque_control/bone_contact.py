@@ -360,6 +360,8 @@ def stop_bones(
         return given
     for i in range(thread, NUM_DOF, threads):
         w.whole[e, i] = w.velocity[e, i] + w.outside[e, i] + w.shares[own, i]
+        if w.reference.shape[0] > 0:
+            w.whole[e, i] = w.whole[e, i] + w.reference[e, i]
     stops = int(0)
     while stops < _MOST_STOPS:
         spread_motion(body, w.pose.position, w.whole, e, e, thread, threads, w.moving)

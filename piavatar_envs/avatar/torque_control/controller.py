@@ -15,13 +15,11 @@ from piavatar_envs.avatar.avatar import Avatar, reset_vectors
 from piavatar_envs.avatar.body.device import BodyPoints
 from piavatar_envs.avatar.body.muscles import (
     FASTEST,
-    LOCKED_JOINTS,
     REFERENCE_HEIGHT,
     REFERENCE_MASS,
     Muscles,
     spring_rows,
 )
-from piavatar_envs.avatar.body.passive import passive_moments
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.correctives import predict_joints
 from piavatar_envs.avatar.rotation import quat_log
@@ -58,7 +56,7 @@ class TorqueControl:
         firm_bones: particles that are moved to their skinned places after every control step, ``(P,)`` bool.
         links: pairs of neighbouring particles, from which strain is measured, shape ``(L, 2)``.
         bone_contact: whether bones stop at boundaries.
-        flesh_stiffness: of the joints by their flesh, shape ``(22, 3, 22, 3)`` [N m/rad].
+        tissue: passive resistance of the joints.
     """
 
     muscles: Muscles
@@ -67,7 +65,7 @@ class TorqueControl:
     firm_bones: np.ndarray
     links: np.ndarray
     bone_contact: bool
-    flesh_stiffness: np.ndarray
+    tissue: JointTissue
 
 
 @wp.kernel
@@ -76,6 +74,7 @@ def set_springs(
     gains: Springs,
     body_mass: wp.array(dtype=float),
     per_size: float,
+    tone: float,
     assist: wp.array(dtype=float),
     released: wp.array(dtype=int),
     torque: wp.array2d(dtype=wp.vec3),
@@ -85,15 +84,15 @@ def set_springs(
 ):
     """Set strength and springs of every body by its mass times its height; over ``(num_envs, 1 + bones)``.
 
-    A muscle that shortens at its greatest speed has no force left, so each torque adds a damper. The pelvis is assisted
-    unless it has been released.
+    ``tone`` is a factor on the springs. A muscle that shortens at its greatest speed has no force left, so each torque
+    adds a damper. The pelvis is assisted unless it has been released.
     """
     e, n = wp.tid()
     m = body_mass[row(e, body_mass.shape[0])]
     r = row(e, body.rest_joint.shape[0])
     size = per_size * m * (body.rest_joint[r, _HEAD][2] - body.rest_joint[r, _FOOT][2])
-    K = size * gains.stiffness[0, n]
-    D = size * gains.damping[0, n]
+    K = tone * (size * gains.stiffness[0, n])
+    D = tone * (size * gains.damping[0, n])
     if n == 0:
         factor[e] = size
     if n < 2:
@@ -195,11 +194,7 @@ class TorqueController:
             points, avatar.body, model, rows, rows, *flesh, parameters.bone_contact, parameters.links
         )
         self.joints.set_strength(muscles.lower, muscles.upper, n)
-        locked = [joint_index(name) for name in LOCKED_JOINTS]
-        ranges = muscles.range_lower, muscles.range_upper
-        self.joints.set_tissue(
-            JointTissue(muscles.tissue_damping, *ranges, locked, passive_moments(), parameters.flesh_stiffness)
-        )
+        self.joints.set_tissue(parameters.tissue)
         state = avatar.state
         self.joints.support = make_struct(Support, force=state.wrench_force, torque=state.wrench_torque)
         self.joints.target = make_struct(
@@ -254,7 +249,12 @@ class TorqueController:
         avatar.record_clear_support(graph)
         inputs = [avatar.body, avatar.model.control_dt, joints.pose, self.state.velocity]
         avatar.record_corrections(graph, predict_joints, inputs)
-        inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, self.assist, avatar.state.released]
+        self.record_springs(graph, 1.0)
+
+    def record_springs(self, graph: LaunchGraph, tone: float) -> None:
+        """Append strength and springs for the current bodies; ``tone`` is a factor on the springs."""
+        avatar, joints = self.avatar, self.joints
+        inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, tone, self.assist, avatar.state.released]
         graph.launch(
             set_springs,
             (avatar.model.num_envs, 1 + NUM_JOINTS),

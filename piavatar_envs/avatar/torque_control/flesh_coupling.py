@@ -124,6 +124,8 @@ def attach_flesh(
         n = body.first + p
         arm = vector_at(x, e, n) - pelvis
         v = vector_at(u, e, n) + vector_at(driven.vk, e, n)
+        if w.commanded.shape[1] > 0:
+            v -= vector_at(w.commanded, e, p)
         m = number_at(mass, r, n)  # loaded before any store, to avoid waiting for it
         own_rate = number_at(rate, row(e, rate.shape[0]), p)
         rate_inside = correction_rate(body, per_time, e, p)
@@ -141,6 +143,13 @@ def attach_flesh(
     sync_block()
     store_second_vectors(arena, last - first, thread, threads, e, body.first + first, u)
     sum_partition(partitions, arena, pelvis, e, at[1], w)
+
+
+@wp.func
+def chord(start: wp.vec3, end: wp.vec3, way: wp.vec3, spin: wp.vec3, dt: float):
+    """Return the velocity from ``start`` [m] to beside the place ``end``, from which ``way`` leads back when turned."""
+    turn = wp.cross(spin, way)
+    return (end - way - start) / dt - turn - 0.5 * dt * wp.cross(spin, turn)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 10))
@@ -184,8 +193,7 @@ def split_velocity(
         steps = blend_steps(w.steps, e, body.skin, p)
         end = blend_places(w.end, e, body.skin, p, pulled_rest(body, elapsed, e, p, w))
         spin = wp.vec3(steps[6], steps[7], steps[8])
-        turn = wp.cross(spin, way)
-        vk = (end - way - arm) / dt - turn - 0.5 * dt * wp.cross(spin, turn)
+        vk = chord(arm, end, way, spin, dt)
         total += blended_motion(steps, arm) + apart
         store_triple(u, driven.vk, driven.spin, e, n, total - vk, vk, spin, True)
         p += threads

@@ -65,6 +65,10 @@ class TorqueWorkspace:
     end: wp.array2d(dtype=wp.mat44)
     slip: wp.array2d(dtype=wp.vec3)  # as in JointState
     pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) position of its joint at the start of the substep [m]
+    # commanded motion, in which the joints move; arrays without entries where there is none
+    reference: wp.array2d(dtype=float)  # (num_envs, 69) commanded velocity of the joints
+    # (num_envs, particles) commanded velocity in the last substep, less what it has changed of ``J qdot`` [m/s]
+    commanded: wp.array2d(dtype=wp.vec3)
 
 
 # Words of a warp's arena: the factor, whose place first holds the bones' momenta; four shares, the bones'
