@@ -77,8 +77,9 @@ class Receivers:
     used_start: wp.array(dtype=int)
     point: wp.array(dtype=int)
     share: wp.array(dtype=float)  # the same weights in this order
-    force: wp.array2d(dtype=wp.vec3)  # (num_envs, N) workspace: impulse [N s]
-    couple: wp.array2d(dtype=wp.vec3)  # (num_envs, N) workspace: moment about the particles' mean [N m s]
+    # workspace in the memory of the obstacles' ``start`` and ``start_normal``, which the next control step writes anew
+    force: wp.array2d(dtype=wp.vec3)  # (num_envs, N) impulse [N s]
+    couple: wp.array2d(dtype=wp.vec3)  # (num_envs, N) moment about the particles' mean [N m s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +130,10 @@ class ObstacleSurfaces:
         self._record(graph, self.obstacles.end, self.obstacles.end_normal)
 
     def record_reaction(self, graph: LaunchGraph, state: State) -> None:
-        """Append the launches that give the cloth's impulses to the particles, except in failed environments."""
+        """Append the launches that give the cloth's impulses to the particles, except in failed environments.
+
+        Where the surfaces were before the step is lost.
+        """
         n, model = self._model.num_envs, self._model
         graph.launch(sum_couples, (n, self._first[-1]), [state.x, state.failure, self.obstacles], [self._receivers])
         inputs = [self._receivers, model.particles.mass, model.grid.dx, state.failure]
@@ -141,7 +145,7 @@ class ObstacleSurfaces:
         graph.launch(find_normals, points.shape, [self.obstacles, points], [normals])
 
     def _connect(self) -> Receivers:
-        n, device = self._model.num_envs, self._model.device
+        device = self._model.device
         weights = sparse.csr_array(sparse.vstack([piece.weights for piece in self.pieces]))
         weights.eliminate_zeros()
         weights.sort_indices()
@@ -157,8 +161,8 @@ class ObstacleSurfaces:
             used_start=_integers(np.append(back.indptr[used], back.nnz), device),
             point=_integers(back.indices, device),
             share=wp.array(back.data.astype(np.float32), dtype=float, device=device),
-            force=wp.zeros((n, weights.shape[0]), dtype=wp.vec3, device=device),
-            couple=wp.zeros((n, weights.shape[0]), dtype=wp.vec3, device=device),
+            force=self.obstacles.start,
+            couple=self.obstacles.start_normal,
         )
 
 
@@ -194,7 +198,7 @@ def allocate(pieces: Sequence[Piece], num_envs: int, device: str) -> Obstacles:
 
 def bytes_of_obstacles(points: int) -> int:
     """Return the memory of so many points in an environment, without what skins work in [bytes]."""
-    return points * (6 * 12 + 6 * 8)
+    return points * (4 * 12 + 6 * 8)
 
 
 def spread(points: np.ndarray, count: int = POSTS) -> np.ndarray:
