@@ -33,7 +33,30 @@ except ImportError as error:
     raise missing("this view", "torch", "skrl") from error
 
 
-class AvatarSkrlEnv(HostView):
+class _TorchView(HostView):
+    """What the views for skrl share: environments whose arrays are tensors."""
+
+    def _open(
+        self,
+        view: type,
+        task: type[Task],
+        num_envs: int,
+        device: str,
+        config: Settings,
+        num_threads: int | None,
+        overrides: Mapping[str, Any],
+    ) -> None:
+        """Build the environments; ``view`` is the class whose constructor builds copies of the view."""
+        self.config = load_keywords(task.Config, config, overrides)
+        made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
+        self._build = partial(view.__init__, task=task, **made)
+        made_task = task(self.config)
+        single = made_task.alone() if view is AvatarSkrlEnv else made_task
+        self.host = EpisodeHost(single, num_envs, device, "torch", num_threads)
+        self.num_envs, self.device = num_envs, self.host.api.device
+
+
+class AvatarSkrlEnv(_TorchView):
     """One avatar in each environment, for skrl's wrapper ``"isaaclab-single-agent"``.
 
     An environment that ends is reset in the same step: the observation returned is the first of its next episode, and
@@ -73,17 +96,7 @@ class AvatarSkrlEnv(HostView):
             ImportError: torch is not installed.
             ValueError: an unknown task or device, or no environments.
         """
-        task_class = load_task(task)
-        self.config = load_keywords(task_class.Config, config, overrides)
-        made: dict[str, Any] = {
-            "num_envs": num_envs,
-            "device": device,
-            "num_threads": num_threads,
-            "config": self.config,
-        }
-        self._build = partial(AvatarSkrlEnv.__init__, task=task_class, **made)
-        self.host = EpisodeHost(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
-        self.num_envs, self.device = num_envs, self.host.api.device
+        self._open(AvatarSkrlEnv, load_task(task), num_envs, device, config, num_threads, overrides)
         self.single_observation_space = gym.spaces.Dict({"policy": self.host.observation_space()})
         self.single_action_space = self.host.action_space()
 
@@ -143,7 +156,7 @@ class AvatarSkrlEnv(HostView):
         self.host.close()
 
 
-class AvatarSkrlMultiEnv(HostView):
+class AvatarSkrlMultiEnv(_TorchView):
     """Several avatars in each environment, dictionaries by agent, for skrl's wrapper ``"isaaclab-multi-agent"``.
 
     The arrays always have rows for all agents: an agent that is out keeps its rows while the others of its environment
@@ -194,17 +207,7 @@ class AvatarSkrlMultiEnv(HostView):
             ImportError: torch is not installed.
             ValueError: an unknown task or device, or no environments.
         """
-        task_class = load_task(task)
-        self.config = load_keywords(task_class.Config, config, overrides)
-        made: dict[str, Any] = {
-            "num_envs": num_envs,
-            "device": device,
-            "num_threads": num_threads,
-            "config": self.config,
-        }
-        self._build = partial(AvatarSkrlMultiEnv.__init__, task=task_class, **made)
-        self.host = EpisodeHost(task_class(self.config), num_envs, device, "torch", num_threads)
-        self.num_envs, self.device = num_envs, self.host.api.device
+        self._open(AvatarSkrlMultiEnv, load_task(task), num_envs, device, config, num_threads, overrides)
         self.possible_agents = list(self.host.task.agent_names)
         self.action_spaces = {name: self.host.action_space() for name in self.possible_agents}
         self.observation_spaces = {name: self.host.observation_space() for name in self.possible_agents}
