@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from agents.pid.balance import FRONTAL, GRAVITY, SAGITTAL, Balance, Effort, Stance
 from agents.pid.bones import NUM_DOF, Bones, Posture, force_moments, in_bones
+from agents.pid.gains import gains_for, subtrees
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 
 STANCE = Stance(mass=70.0, height=0.9, behind=0.06, ahead=0.18, beside=0.14, foot_width=0.08)
@@ -168,3 +169,20 @@ def test_moments_of_weight_and_of_forces_do_the_work_that_they_do(bones, local):
     speed = linear[:, foot] + np.cross(spin[:, foot], place - now.centres[:, foot])
     moments = in_bones(now, force_moments(now, foot, place, force))[:, 1:]
     np.testing.assert_allclose(np.einsum("nbi,bi->n", moments, own), (force * speed).sum(1), rtol=1e-6)
+
+
+def test_gains_by_inertia_make_all_joints_respond_alike():
+    """Check two bones on a line: what each joint carries, its sag when held level, and its damping."""
+    line = np.array([[1.0, 0.0, 0.0]])
+    masses, centres, positions = np.array([1.0, 2.0]), line * [[0.1], [0.3]], line * [[0.0], [0.2]]
+    load = subtrees([-1, 0], masses, centres, positions)
+    np.testing.assert_allclose(load.mass, [3.0, 2.0])
+    np.testing.assert_allclose(load.arm, [0.7 / 3.0, 0.1])
+    np.testing.assert_allclose(load.inertia, [1.0 * 0.1**2 + 2.0 * 0.3**2, 2.0 * 0.1**2], atol=1e-12)
+    gains = gains_for(load, 10.0, 0.7, np.full(2, 50.0), integral_time=2.0)
+    np.testing.assert_allclose(GRAVITY * load.mass * load.arm / gains.kp[:, 0], 0.1, rtol=1e-3)
+    rate = np.sqrt(gains.kp / gains.inertia)
+    np.testing.assert_allclose(gains.kd / (2.0 * gains.inertia * rate), 0.7)
+    np.testing.assert_allclose(gains.kp / gains.ki, 2.0)
+    with pytest.raises(ValueError, match="joint 0 comes before its parent 1"):
+        subtrees([1, -1], masses, centres, positions)
