@@ -131,7 +131,7 @@ def test_workers_leave_the_interrupt_to_their_parent(tmp_path):
     assert "Traceback" not in text and "interrupted after" in text.splitlines()[-1]
 
 
-@pytest.mark.parametrize("script", ["demo", "play", "rsl_rl.train", "skrl.train", "pid.score", "compare"])
+@pytest.mark.parametrize("script", ["demo", "play", "rsl_rl.train", "skrl.train"])
 def test_a_script_without_torch_names_the_extra_in_one_line(script, tmp_path):
     (tmp_path / "sitecustomize.py").write_text(
         "import sys\n"

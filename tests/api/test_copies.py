@@ -15,12 +15,13 @@ from gymnasium.vector import AutoresetMode
 from piavatar_envs.api.gym_env import AvatarEnv
 from piavatar_envs.api.vector_env import AvatarVectorEnv
 from piavatar_envs.mpm.types import FAILURE_NONFINITE
-from piavatar_envs.tasks import load_task, task_modules
+from piavatar_envs.tasks import load_task
 from tests.api.runs import SHORT, actions_of, arrays_in, on_host
+from tests.conftest import SAMPLE
 
 KICK, REACH = "PIAvatar/KickBall-v0", "PIAvatar/Reach-v0"
-#: Every task, and one under settings by which more or other things are kept.
-CASES = [(name, {}) for name in task_modules()]
+#: Tasks as they are, and one under settings by which more or other things are kept.
+CASES = [(name, {}) for name in SAMPLE]
 CASES += [
     (KICK, {"shape.randomize": True, "obs_mode": "dict"}),
     (KICK, {"shape.randomize": True, "shape.pool": 3, "randomize.mass_factor": (0.8, 1.25)}),

@@ -36,8 +36,16 @@ def alike(equal, first, second) -> bool:
     return all(equal(a[0], b[0]) and equal(a[1], b[1]) and a[2:] == b[2:] for a, b in zip(first, second, strict=True))
 
 
-def test_every_task_passes_the_checker_and_repeats_and_restores_a_run(make_env, env_id, equal):
+def test_every_task_steps_under_torques(make_env, env_id):
     env = make_env(env_id, control="torque")
+    env.reset(seed=3)
+    for action in actions(env, 3):
+        observation, reward, *_, info = env.step(action)
+        assert np.isfinite(observation).all() and np.isfinite(reward) and info["failure"] == 0
+
+
+def test_torques_pass_the_checker_and_repeat_and_restore_a_run(make_env, sample_id, equal):
+    env = make_env(sample_id, control="torque")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of unbounded spaces
         check_env(env, skip_render_check=True)

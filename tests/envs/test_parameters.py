@@ -27,11 +27,11 @@ def test_parameters_are_what_was_drawn(observed):
     check_term(observed, np.array([False, True, False]))
 
 
-def test_without_ranges_only_the_task_and_the_clock_are_observed(make_env, env_id):
-    plain = make_env(env_id).batch
+def test_without_ranges_only_the_task_and_the_clock_are_observed(make_env, sample_id):
+    plain = make_env(sample_id).batch
     assert PARAMETERS not in plain.layout and "env.parameters" not in plain.get_state()
     assert not any(term.parameters for term in plain.layout.values())
-    batch = make_env(env_id, observe_parameters=True).batch
+    batch = make_env(sample_id, observe_parameters=True).batch
     drawn = [p.name for p in batch.task.drawn() if p.low < p.high]
     settings = [] if batch.control == "pose" else [ASSIST.name]
     assert [p.name for p in batch.layout[PARAMETERS].parameters] == [*settings, *drawn, "clock"]
