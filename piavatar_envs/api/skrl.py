@@ -34,7 +34,7 @@ except ImportError as error:
 
 
 class _TorchView(HostView):
-    """What the views for skrl share: environments whose arrays are tensors."""
+    """Hold environments whose arrays are tensors, as both views for skrl do."""
 
     def _open(
         self,
