@@ -14,7 +14,7 @@ Several, for MAPPO and IPPO::
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -38,7 +38,7 @@ class _TorchView(HostView):
 
     def _open(
         self,
-        view: type,
+        build: Callable[..., None],
         task: type[Task],
         num_envs: int,
         device: str,
@@ -46,14 +46,16 @@ class _TorchView(HostView):
         num_threads: int | None,
         overrides: Mapping[str, Any],
     ) -> None:
-        """Build the environments; ``view`` is the class whose constructor builds copies of the view."""
+        """Build the environments; ``build`` is the constructor that builds copies of the view."""
         self.config = load_keywords(task.Config, config, overrides)
         made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
-        self._build = partial(view.__init__, task=task, **made)
-        made_task = task(self.config)
-        single = made_task.alone() if view is AvatarSkrlEnv else made_task
-        self.host = EpisodeHost(single, num_envs, device, "torch", num_threads)
+        self._build = partial(build, task=task, **made)
+        self.host = EpisodeHost(self._played(task(self.config)), num_envs, device, "torch", num_threads)
         self.num_envs, self.device = num_envs, self.host.api.device
+
+    def _played(self, task: Task) -> Task:
+        """Return the task that the environments play."""
+        return task
 
 
 class AvatarSkrlEnv(_TorchView):
@@ -96,9 +98,13 @@ class AvatarSkrlEnv(_TorchView):
             ImportError: torch is not installed.
             ValueError: an unknown task or device, or no environments.
         """
-        self._open(AvatarSkrlEnv, load_task(task), num_envs, device, config, num_threads, overrides)
+        self._open(AvatarSkrlEnv.__init__, load_task(task), num_envs, device, config, num_threads, overrides)
         self.single_observation_space = gym.spaces.Dict({"policy": self.host.observation_space()})
         self.single_action_space = self.host.action_space()
+
+    def _played(self, task: Task) -> Task:
+        """Return the task with one agent, the others still."""
+        return task.alone()
 
     @property
     def unwrapped(self) -> AvatarSkrlEnv:
@@ -207,7 +213,7 @@ class AvatarSkrlMultiEnv(_TorchView):
             ImportError: torch is not installed.
             ValueError: an unknown task or device, or no environments.
         """
-        self._open(AvatarSkrlMultiEnv, load_task(task), num_envs, device, config, num_threads, overrides)
+        self._open(AvatarSkrlMultiEnv.__init__, load_task(task), num_envs, device, config, num_threads, overrides)
         self.possible_agents = list(self.host.task.agent_names)
         self.action_spaces = {name: self.host.action_space() for name in self.possible_agents}
         self.observation_spaces = {name: self.host.observation_space() for name in self.possible_agents}
