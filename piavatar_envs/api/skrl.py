@@ -103,7 +103,7 @@ class AvatarSkrlEnv(_TorchView):
         self.single_action_space = self.host.action_space()
 
     def _played(self, task: Task) -> Task:
-        """Return the task with one agent, the others still."""
+        """Return the task, which must have one agent."""
         return task.alone()
 
     @property
