@@ -1,4 +1,4 @@
-"""Trainings, controllers and evaluations, run from a checkout (``python -m agents.NAME``); not part of the wheel.
+"""Training runs, controllers and evaluations, run from a checkout (``python -m agents.NAME``); not part of the wheel.
 
 As a script, a module that is not installed and Ctrl-C end it in one line instead of a traceback.
 """

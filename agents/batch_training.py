@@ -1,4 +1,4 @@
-"""Trainings on one batch, for any library: configuration, command line, evaluation.
+"""Training runs on one batch, for any library: configuration, command line, evaluation.
 
 A batch advances all its environments in the same kernel launches and hands out tensors on their device. The learning
 itself is in ``agents/skrl/train.py`` and ``agents/rsl_rl/train.py``. Where torchrun has started several processes, each
@@ -43,7 +43,7 @@ from piavatar_envs.tasks import listed_name
 
 
 class BatchTraining(BaseModel):
-    """Settings of a training on a batch; a library's own settings come in a subclass."""
+    """Settings of a training run on a batch; a library's own settings come in a subclass."""
 
     model_config = FROZEN
 
@@ -71,12 +71,12 @@ class BatchTraining(BaseModel):
         """Return the seed of environment 0's episodes on a rank, whose batch follows that of the rank before.
 
         Raises:
-            ConfigError: all ranks together have more environments than a training may have.
+            ConfigError: all ranks together have more environments than a training run may have.
         """
         if (count := ranks.size * self.num_envs) > MOST_ENVS:
             raise ConfigError(
-                f"num_envs={self.num_envs} on each of {ranks.size} ranks are {count} environments, and a training may "
-                f"have {MOST_ENVS}; use fewer"
+                f"num_envs={self.num_envs} on each of {ranks.size} ranks are {count} environments, and a training run "
+                f"may have {MOST_ENVS}; use fewer"
             )
         return self.first_seed + ranks.rank * self.num_envs
 
@@ -87,7 +87,7 @@ class BatchTraining(BaseModel):
 
 
 Training = TypeVar("Training", bound=BatchTraining)
-#: From a training's environment id to the task.
+#: From a training run's environment id to the task.
 FindTask = Callable[[str], type[Task]]
 
 
@@ -103,7 +103,7 @@ def load_batched(
         cls: of the library's training.
         find_task: the task of an environment's id; a ValueError where there is none.
         source: a YAML file or a mapping.
-        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
+        overrides: settings that override it, as from a command line; ``env.NAME`` for those of the environment.
 
     Raises:
         ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment; or more
@@ -134,7 +134,7 @@ class Learned:
 
 
 def iterations_of(checkpoint: Checkpoint, asked: int) -> int:
-    """Return the iterations that a training has had when it begins or resumes.
+    """Return the iterations that a training run has had when it begins or resumes.
 
     Raises:
         ConfigError: more than are asked for.
@@ -151,7 +151,7 @@ class Options:
 
     #: YAML file with what differs from the defaults
     config: tyro.conf.Positional[Path]
-    #: settings that win over the file: iterations=10 env.fidelity=tiny num_envs=256
+    #: settings that override the file: iterations=10 env.fidelity=tiny num_envs=256
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: folder to write to; by default runs/ and the name of the file
     out: Path | None = None

@@ -1,4 +1,4 @@
-"""The checkpoint of a training: one file, written atomically, that names the run it belongs to.
+"""The checkpoint of a training run: one file, written atomically, that names the run it belongs to.
 
 A killed run resumes from it, and on the same CPU (with as many threads for torch) gives the same curve and the same
 networks, bit for bit, as one without the interruption. A checkpoint therefore holds everything that the future depends
@@ -6,9 +6,9 @@ on: networks, optimizers, random numbers, environments (0.4 MB each at ``fidelit
 the learner saw last, and the curve so far. It is read without running code that it might carry
 (``torch.load(weights_only=True)``).
 
-A training of several ranks has one file, too: rank 0 writes and reads it, and exchanges the states with the others.
+A training run of several ranks has one file, too: rank 0 writes and reads it, and exchanges the states with the others.
 
-A training whose parameters or outputs are no longer finite ends in an error before it writes anything.
+A training run whose parameters or outputs are no longer finite ends in an error before it writes anything.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from piavatar_envs.doctor import package_version
 FORMAT = 5
 #: Settings that what has been learned so far does not depend on.
 FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation", "env.render")
-#: Of these, how long a training is, and the settings that change with how much of it is over: where there is one, what
-#: has been learned so far does depend on the length.
+#: Of these, how long a training run is, and the settings that change with how much of it is over: where there is one,
+#: what has been learned so far does depend on the length.
 LENGTHS, FALLING = ("total_steps", "iterations"), ("ppo.final_kl", "ppo.final_learning_rate")
 #: Packages whose version the arithmetic depends on.
 PACKAGES = (
@@ -70,8 +70,8 @@ class Checkpoint:
 
         Raises:
             ConfigError: a checkpoint of another configuration, device or version, or one that cannot be read; or
-                there is one, and ``resume`` was not asked for; or the folder is another training's, that runs or that
-                was kept without its checkpoint.
+                there is one, and ``resume`` was not asked for; or the folder is that of another training run, which is
+                still going on or was kept without its checkpoint.
         """
         self.path = folder / CHECKPOINT
         self.reached, self.stop, self.ranks = "", StopRequest(ranks), ranks
@@ -94,11 +94,13 @@ class Checkpoint:
         if not self.path.exists():
             for name in (*POLICIES, RESULTS):
                 if (folder / name).exists():
-                    raise ConfigError(f"{folder / name} is of a training that has ended; write elsewhere with --out")
+                    raise ConfigError(
+                        f"{folder / name} is of a training run that has ended; write elsewhere with --out"
+                    )
             return [None] * self.ranks.size
         if not resume:
             raise ConfigError(
-                f"{folder} holds a training already; go on with --resume, write to another folder with --out, or "
+                f"{folder} holds a training run already; go on with --resume, write to another folder with --out, or "
                 f"delete {self.path} to lose it"
             )
         content = read_checkpoint(self.path)
@@ -120,7 +122,7 @@ class Checkpoint:
             write_atomically(self.path, lambda file: torch.save(content, file))
 
     def remedy(self, command: str) -> str:
-        """Return what an interrupted training has reached, and how to go on.
+        """Return what an interrupted training run has reached, and how to go on.
 
         Args:
             command: line that resumes it.
@@ -130,7 +132,7 @@ class Checkpoint:
         return f"after {self.reached}; go on with {command}"
 
     def _length(self, state: Mapping[str, Any]) -> str:
-        """Return the length of a training in this state, for messages."""
+        """Return the length of a training run in this state, for messages."""
         for unit, length in (("steps", "total_steps"), ("iterations", "iterations")):
             if unit in state:
                 return f"{state[unit]} of {self._about['config'][length]} {unit}"
@@ -216,7 +218,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple
 
 
 def settings_changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Return :func:`differences` of two trainings that learning so far depends on."""
+    """Return :func:`differences` of two training runs that learning so far depends on."""
     falls = any(flattened(now).get(name) is not None for name in FALLING)
     free = [name for name in FREE if not (falls and name in LENGTHS)]
     return [
@@ -278,7 +280,7 @@ def set_random_states(states: Mapping[str, Any]) -> None:
 
 
 class Diverged(ArithmeticError):
-    """A training with parameters or outputs that are not finite; the message is one line."""
+    """A training run with parameters or outputs that are not finite; the message is one line."""
 
 
 def check_finite(

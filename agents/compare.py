@@ -1,7 +1,7 @@
-"""Sum up trainings that differ in their seed: ``python -m agents.compare runs/reach_*/results.json --out FILE.json``.
+"""Sum up runs that differ in their seed: ``python -m agents.compare runs/reach_*/results.json --out FILE.json``.
 
 The runs are of ``agents.sb3.train``, ``agents.rsl_rl.train`` or ``agents.skrl.train``, each with a seed of its own.
-What no seed of a training changes (zero and random actions) is shown once, with its interval over episodes.
+What no seed of a training run changes (zero and random actions) is shown once, with its interval over episodes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from agents.evaluate import over_seeds
 from agents.files import check_figures, plain, read_json, write_json
 from piavatar_envs.cli import print_any_text
 
-#: Settings that may differ: nothing that is learned depends on how often a training is saved.
+#: Settings that may differ: nothing that is learned depends on how often a training run is saved.
 FREE = ("seed", "checkpoint_every")
 #: Agents that are not trained: every run has played the same episodes with the same actions.
 UNTRAINED = ("zero", "random")
@@ -112,7 +112,7 @@ def _shown(mean: float, interval: Sequence[float], form: str) -> str:
 
 @dataclass(frozen=True)
 class Options:
-    """Sum up trainings that differ in their seed."""
+    """Sum up training runs that differ in their seed."""
 
     #: results.json of every run, or its folder
     runs: tyro.conf.Positional[tuple[Path, ...]]

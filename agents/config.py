@@ -1,4 +1,4 @@
-"""Configurations of trainings: what all libraries' have in common, seeds of episodes, and what a policy is made for."""
+"""Configurations of training runs: what they share in all libraries, seeds of episodes, and what a policy is for."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ EntropyWeight = Annotated[float, Field(ge=0.0, description="weight of the entrop
 LogStd = Annotated[float, Field(ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")]
 #: Training episodes begin here; those of evaluations, which no agent was trained on, end before it.
 FIRST_TRAINED = 2**30
-#: Environments that one training can have: so many seeds are its own.
+#: Environments that one training run can have: so many seeds are its own.
 MOST_ENVS = 2**16
-#: Seeds that trainings can have: the episodes' seeds stay below 2^31.
+#: Seeds that training runs can have: the episodes' seeds stay below 2^31.
 MOST_RUNS = 1000
 
 
@@ -95,7 +95,7 @@ def load_resolved(
         cls: of the configuration; its attribute ``obs_modes`` names what its networks take, if more than vectors.
         env_class: the environment's configuration class; a ValueError where there is no such environment.
         source: a YAML file or a mapping.
-        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
+        overrides: settings that override it, as from a command line; ``env.NAME`` for those of the environment.
 
     Raises:
         ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.

@@ -45,7 +45,7 @@ _FRAME = 0.1  # rendering and encoding a frame whose halves are drawn in paralle
 class Options:
     """Train PPO on Reach on the CPU, and show what it has learned."""
 
-    #: settings that win over configs/sb3/reach_ppo.yaml: total_steps=1000 env.fidelity=tiny
+    #: settings that override configs/sb3/reach_ppo.yaml: total_steps=1000 env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: folder to write to
     out: Path = Path("runs/demo")

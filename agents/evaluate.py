@@ -8,7 +8,7 @@ and every episode that was begun counts once. What is counted is the return, the
 An agent is anything that is called with observations ``(n, observation_size)`` and returns actions
 ``(n, action_size)``. One that remembers also has ``begin(n)``, which is called at the start of every round.
 
-Results of one training vary with its seed: :func:`over_seeds` sums up several seeds.
+Results of one training run vary with its seed: :func:`over_seeds` sums up several seeds.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     seeds?", arXiv 1806.08295.)
 
     Args:
-        rows: of the same agent in the same episodes, as :meth:`Evaluation.row` gives them, one a seed.
+        rows: of the same agent in the same episodes, as :meth:`Evaluation.row` gives them, one per seed.
 
     Raises:
         ValueError: no rows, or of different agents or numbers of episodes.
@@ -257,7 +257,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _motions_over_seeds(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Average rows of :func:`by_motion` of several trainings in the same episodes."""
+    """Average rows of :func:`by_motion` of several training runs in the same episodes."""
     of_motion: dict[str, list[Mapping[str, Any]]] = {}
     for row in (row for table in tables for row in table):
         of_motion.setdefault(row["motion"], []).append(row)
@@ -269,7 +269,7 @@ def _motions_over_seeds(tables: Sequence[Sequence[Mapping[str, Any]]]) -> list[d
 
 
 def _tracking_over_seeds(rows: Sequence[Mapping[str, Any]], episodes: int) -> dict[str, Any]:
-    """Average figures of :func:`tracking_of` of several trainings in the same ``episodes``."""
+    """Average figures of :func:`tracking_of` of several training runs in the same ``episodes``."""
     shares = [row["followed"] for row in rows]
     figures = {key: float(np.mean([row[key] for row in rows])) for key, _ in TRACKING.values()}
     interval = share_interval_over_seeds(shares, episodes)
@@ -277,7 +277,7 @@ def _tracking_over_seeds(rows: Sequence[Mapping[str, Any]], episodes: int) -> di
 
 
 def _pooled(pushes: Sequence[Mapping[str, Any]], seeds: int) -> list[dict[str, Any]]:
-    """Pool classes of pushes of several trainings in the same episodes; intervals are those of one training."""
+    """Pool classes of pushes of several training runs in the same episodes; intervals are those of one run."""
     classes: dict[tuple[float, float], list[bool]] = {}
     for push in pushes:
         lasted = round(push["lasted"] * push["episodes"])

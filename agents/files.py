@@ -24,10 +24,10 @@ from piavatar_envs.core.writing import check_writable
 
 try:
     import fcntl
-except ImportError:  # Windows has no such locks, so two trainings in one folder go unnoticed
+except ImportError:  # Windows has no such locks, so two training runs in one folder go unnoticed
     fcntl = None
 
-#: Files of a training: checkpoint, policies, and the figures that are written last.
+#: Files of a training run: checkpoint, policies, and the figures that are written last.
 CHECKPOINT, POLICIES, RESULTS = "checkpoint.pt", ("policy.pt", "policy.zip"), "results.json"
 #: Folders that this process holds, and by what; the system releases them however the process ends.
 _HELD: dict[Path, int] = {}
@@ -102,7 +102,9 @@ def hold(folder: Path) -> None:
     except OSError as error:
         os.close(held)
         if isinstance(error, BlockingIOError):
-            raise ConfigError(f"another training writes to {folder}; end it, or write elsewhere with --out") from None
+            raise ConfigError(
+                f"another training run writes to {folder}; end it, or write elsewhere with --out"
+            ) from None
         return  # a file system without locks
     _HELD[path] = held
 
@@ -148,14 +150,14 @@ def claim(folder: Path, script: str, own: tuple[str, ...] = ()) -> None:
         own: files that come with results of this script, and are lost with them.
 
     Raises:
-        ConfigError: it holds a training, or another script's results; or nothing can be written.
+        ConfigError: it holds a training run, or another script's results; or nothing can be written.
     """
     results = folder / RESULTS
     check_figures(results, script)
     for name in (CHECKPOINT, *POLICIES):
         if (folder / name).exists() and not (name in own and results.exists()):
             raise ConfigError(
-                f"{folder / name} is of a training; write elsewhere with --out, or delete it to lose what was learned"
+                f"{folder / name} is of a training run; write elsewhere with --out, or delete it with what was learned"
             )
     if folder.is_dir():
         hold(folder)

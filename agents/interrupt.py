@@ -1,4 +1,4 @@
-"""Ctrl-C in trainings: the first one ends a training where it can be resumed, the second one at once."""
+"""Ctrl-C in training runs: the first one ends a training run where it can be resumed, the second one at once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NOTICE = b"\nending where the training can go on later, after this rollout; Ctr
 
 
 class StopRequest:
-    """Request to end a training, made by Ctrl-C while :meth:`listening`.
+    """Request to end a training run, made by Ctrl-C while :meth:`listening`.
 
     Attributes:
         made: whether there was one in this process.

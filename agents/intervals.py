@@ -1,4 +1,4 @@
-"""95 % intervals: of shares of episodes, and of what trainings of several seeds have on average."""
+"""95 % intervals: of shares of episodes, and of what training runs of several seeds have on average."""
 
 from __future__ import annotations
 

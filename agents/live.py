@@ -73,7 +73,7 @@ class Policy:
 
 
 def policy_kind(run: Run) -> AgentKind:
-    """Return the agent of a training, with the settings that it was trained under."""
+    """Return the agent of a training run, with the settings that it was trained under."""
     return AgentKind(lambda host, _seed: Policy(run, host), {"config": run.env})
 
 
@@ -82,7 +82,7 @@ def live_agents(env_id: str, name: str = "") -> dict[str, AgentKind]:
 
     Args:
         env_id: of the environment.
-        name: the folder of a training that is to be among them, if it is one.
+        name: the folder of a training run that is to be among them, if it is one.
 
     Raises:
         ConfigError: the training is of another environment.

@@ -1,8 +1,8 @@
-"""Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
+"""Let what a training run has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
 
 Takes the folder of a run with one agent, by ``agents.rsl_rl.train`` or ``agents.rllib.train`` (policy.pt), or by
 ``agents.sb3.train`` (policy.zip), builds the environment of its config.yaml, and plays the episodes of its evaluation.
-Of an interrupted training it takes the policy in the checkpoint. With ``--film`` or ``--export`` alone it plays no
+Of an interrupted training run it takes the policy in the checkpoint. With ``--film`` or ``--export`` alone it plays no
 others; with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
 
 A video of one agent, or of two in the same episodes side by side.
@@ -46,7 +46,7 @@ from piavatar_envs.tasks import load_task
 
 @dataclass(frozen=True)
 class Run:
-    """A training, finished or interrupted, as read from its folder.
+    """A training run, finished or interrupted, as read from its folder.
 
     Attributes:
         env_id: registered id.
@@ -68,7 +68,7 @@ def open_run(folder: Path, device: str = "cpu", imports: Collection[str] = ()) -
     """Open a run by its folder.
 
     Args:
-        folder: with config.yaml and policy.pt, policy.zip or, of an interrupted training, checkpoint.pt.
+        folder: with config.yaml and policy.pt, policy.zip or, of an interrupted training run, checkpoint.pt.
         device: torch's, where a policy of rsl_rl computes.
         imports: modules that the id of its environment may import.
 
@@ -77,15 +77,15 @@ def open_run(folder: Path, device: str = "cpu", imports: Collection[str] = ()) -
             another module.
     """
     if not folder.is_dir():
-        raise ConfigError(f"no folder {folder}; give the one that a training has left, as in runs/")
+        raise ConfigError(f"no folder {folder}; give the one that a training run has left, as in runs/")
     settings, kinds = folder / "config.yaml", {"policy.pt": _open_torch, "policy.zip": _open_sb3}
     found = [folder / name for name in (*kinds, CHECKPOINT) if (folder / name).is_file()]
     if not settings.is_file() or not found:
         raise ConfigError(
-            f"{folder} must hold config.yaml and {', '.join(kinds)} or {CHECKPOINT}, as a training leaves them"
+            f"{folder} must hold config.yaml and {', '.join(kinds)} or {CHECKPOINT}, as a training run leaves them"
         )
     check_imports(read_yaml(settings).get("env_id", ""), settings, imports)
-    # of a training that was resumed and interrupted, the checkpoint is the newer one
+    # of a training run that was resumed and interrupted, the checkpoint is the newer one
     latest = max(found, key=lambda path: (path.stat().st_mtime, path.name != CHECKPOINT))
     if latest.name == CHECKPOINT:
         return _open_interrupted(settings, latest, device)
@@ -153,11 +153,11 @@ def _check_single(single: bool, env_id: str, settings: Path) -> None:
 
 @dataclass(frozen=True)
 class Options:
-    """Play the policy of a training, finished or interrupted."""
+    """Play the policy of a training run, finished or interrupted."""
 
     #: folder of the run
     run: tyro.conf.Positional[Path]
-    #: settings of the environment that win over the run's: fidelity=tiny, or as for the training env.fidelity=tiny
+    #: settings of the environment that override the run's: fidelity=tiny, or as for the training env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: episodes to score, by default as many as the training's evaluation has, or none with --film or --export alone
     episodes: int | None = None
@@ -211,7 +211,7 @@ def check_options(options: Options) -> None:
 
 
 def environment(run: Run, assignments: Sequence[str]) -> Task:
-    """Build the task of a run's environment, with settings that win over those of the training.
+    """Build the task of a run's environment, with settings that override those of the training.
 
     Raises:
         ConfigError: a setting is unknown, given twice or out of range, or makes another environment of it than the one
@@ -328,7 +328,7 @@ def film(
         make: makes the environments.
         agents: one or two of them, by the text that stands in their half.
         seeds: of the episodes.
-        fps: control steps a second, so that the video runs as fast as life.
+        fps: control steps per second, so that the video runs as fast as life.
         every: control steps between two pictures.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Ranks: the processes of one training that ``torchrun`` starts, each with a batch of environments of its own.
+"""Ranks: the processes of one training run that ``torchrun`` starts, each with a batch of environments of its own.
 
 ``torchrun --nproc-per-node=2 -m agents.rsl_rl.train ...`` starts two. With ``--device cuda`` each takes the GPU of its
 local rank, and gradients are summed by NCCL; on a CPU, or where all share the one GPU of ``--device cuda:0``, by Gloo.
@@ -44,7 +44,7 @@ _GRACE = 10.0
 
 @dataclass(frozen=True)
 class Ranks:
-    """Place of this process among those of a training; by default it is the only one.
+    """Place of this process among those of a training run; by default it is the only one.
 
     Attributes:
         rank: from 0 to ``size - 1``.
@@ -160,13 +160,13 @@ def _receive(rank: int) -> Any:
     return torch.load(io.BytesIO(content.numpy()), weights_only=True)
 
 
-#: A training in one process.
+#: A training run in one process.
 ALONE = Ranks()
 
 
 @contextmanager
 def joined(ranks: Ranks, asked: str) -> Iterator[str]:
-    """Join the group of a training's processes for the duration, with the device of this rank; all end it together.
+    """Join the group of a training run's processes for the duration, with the device of this rank; all end it together.
 
     An error on one rank ends the others, too, with its message: torchrun ends those on the same machine, and on other
     machines a thread reads the message from torchrun's store. A rank without a heartbeat for 40 seconds counts as

@@ -1,4 +1,4 @@
-"""Reports of a training: tables, the learning curve, and JSON."""
+"""Reports of a training run: tables, the learning curve, and JSON."""
 
 from __future__ import annotations
 

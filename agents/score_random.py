@@ -1,9 +1,9 @@
 """Scores of random actions, of several seeds: ``python -m agents.score_random RUN --out FOLDER``.
 
-Plays the environment of a run, which is any folder with the ``results.json`` of a training or of ``agents.pid.score``.
-Every seed is a stream of actions of its own, in the episodes that all agents are evaluated in, and counts as a
-training's does: intervals are over seeds. ``agents.scores`` puts this row in the place of those of single streams, in
-all runs of these settings.
+Plays the environment of a run, which is any folder with the ``results.json`` of a training run or of
+``agents.pid.score``. Every seed is a stream of actions of its own, in the episodes that all agents are evaluated in,
+and counts as a training run does: intervals are over seeds. ``agents.scores`` puts this row in the place of those of
+single streams, in all runs of these settings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Options:
 
     #: folder of the run
     run: tyro.conf.Positional[Path]
-    #: settings of the environment that win over the run's: fidelity=tiny
+    #: settings of the environment that override the run's: fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: streams of random actions
     seeds: int = 5
@@ -52,7 +52,7 @@ def score(batch: EpisodeHost, first_seed: int, count: int) -> dict[str, Any]:
     Args:
         batch: plays an episode in each of its environments.
         first_seed: of the episodes, the same for all streams.
-        count: of streams; the seed of each is the one with which a training of that place would begin.
+        count: of streams; the seed of each is the one with which a training run of that place would begin.
     """
     streams = [random_agent(batch.action_size, first_training_seed(stream)) for stream in range(count)]
     return over_seeds([play("random", for_all_seats(stream), batch, first_seed).row() for stream in streams])
@@ -62,7 +62,7 @@ def check_streams(count: int) -> None:
     """Refuse a number of streams that is out of range.
 
     Raises:
-        ConfigError: a count that has no interval, or is larger than that of the seeds that trainings can have.
+        ConfigError: a count that has no interval, or is larger than that of the seeds that training runs can have.
     """
     if not 2 <= count <= MOST_RUNS:
         raise ConfigError(f"seeds={count} must be >= 2 and <= {MOST_RUNS}: of one there is no interval")
@@ -104,7 +104,9 @@ def environment_of(folder: Path) -> tuple[str, Mapping[str, Any]]:
     run = read_json(path)
     config = run.get("config", {}) if isinstance(run, dict) else {}
     if not {"env_id", "env"} <= set(config):
-        raise ConfigError(f"{path} has no config.env_id and config.env; give the folder of a training or of score_pid")
+        raise ConfigError(
+            f"{path} has no config.env_id and config.env; give the folder of a training run or of score_pid"
+        )
     return config["env_id"], config["env"]
 
 

@@ -48,7 +48,7 @@ from piavatar_envs.tasks import load_task
 
 #: Script of runs that are random actions of several streams.
 STREAMS = "score_random"
-#: Names of agents by the script of their run: of a training, library and algorithm.
+#: Names of agents by the script of their run: of a training run, library and algorithm.
 _LEARNERS = {"pid.score": "PID", "rsl_rl.train": "rsl_ppo", "sb3.train": "sb3_ppo", "skrl.train": "skrl_mappo"}
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
@@ -99,12 +99,12 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _order(env_id: str, script: str) -> tuple[str, bool, str]:
-    """Order trainings before what is scored without one, whose baselines count only where no training has any."""
+    """Order training runs before other runs, whose baselines count only where no training run has any."""
     return env_id, script in ("PID", STREAMS), script
 
 
 def _learner(run: Mapping[str, Any]) -> str:
-    """Name the library and the algorithm of a training, or the script of another run."""
+    """Name the library and the algorithm of a training run, or the script of another run."""
     if run["benchmark"] == "sb3.train" and run["config"].get("sac"):
         return "sb3_sac"
     return _LEARNERS.get(run["benchmark"], run["benchmark"])
@@ -168,7 +168,7 @@ def _check_alike(group: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the mean time and steps of the trainings; None where nothing is trained."""
+    """Return the mean time and steps of the training runs; None where nothing is trained."""
     seconds = [run.get("training_s") for run in group.values()]
     steps = [run.get("train_steps") for run in group.values()]
     return {

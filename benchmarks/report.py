@@ -179,7 +179,7 @@ def large_bodies(page: Page) -> None:
     figure.savefig(page.folder / "substep.png", dpi=110, bbox_inches="tight")
     page.picture(page.folder / "substep.png", "Time of a substep over the number of particles")
     page.table(
-        ("case", "particles", "ms a substep"),
+        ("case", "particles", "ms per substep"),
         ((row["case"], row["particles"], row["ms_per_substep"]) for one in results for row in one.rows),
     )
     page.add(*(one.source(page.folder) for one in results))

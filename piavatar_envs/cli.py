@@ -122,7 +122,7 @@ def play_command(
 def watch_command(
     env_id: EnvId = "",
     agent: Annotated[
-        str, tyro.conf.arg(help="random, zero, clip:NAME, or from a clone pid or the folder of a training")
+        str, tyro.conf.arg(help="random, zero, clip:NAME, or from a clone pid or the folder of a training run")
     ] = "random",
     num_envs: Annotated[int, tyro.conf.arg(help="environments, of which the browser shows one")] = 1,
     seed: Seed = 0,

@@ -78,7 +78,7 @@ def kernel_cache() -> dict[str, Any]:
 
 
 def memory_estimate() -> dict[str, Any]:
-    """Return particles, grid nodes, substeps a step and bytes of one environment with default settings.
+    """Return particles, grid nodes, substeps per step and bytes of one environment with default settings.
 
     Besides, the vertices of a skirt and the bytes that an environment has more with one.
     """
@@ -174,7 +174,7 @@ def show(report: dict[str, Any], *, as_json: bool = False) -> None:
         remedy = install_command(name)
         table.add_row(f"extra {name}", f"missing {', '.join(missing)}: {remedy}" if missing else "present")
     size = report["default_env"]
-    shape = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps a step"
+    shape = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps per step"
     table.add_row("default env", f"{shape}: {size['bytes'] / 2**20:.1f} MiB each")
     skirt = f"{size['skirt_vertices']} vertices: {size['skirt_bytes'] / 2**20:.1f} MiB more in an environment"
     table.add_row("with a skirt", skirt)

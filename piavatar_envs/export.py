@@ -65,7 +65,7 @@ class Recording:
         self._scenes, self._color = SceneReader(batch), color
 
     def add(self) -> None:
-        """Append what there is to see now, as the next frame: one a step in real time.
+        """Append what there is to see now, as the next frame: one per step in real time.
 
         What is not finite, because the simulation has failed, is left out with a warning; so are the frames after a
         glTF file is full.

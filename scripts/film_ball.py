@@ -16,7 +16,7 @@ from piavatar_envs.multi import sumo_v0
 from piavatar_envs.render.video import write_video
 from scripts.pages.entries import ROOT
 
-#: Control steps a second, those between two pictures, and shown pictures a second: few, for a small file.
+#: Control steps per second, those between two pictures, and shown pictures per second: few, for a small file.
 SIMULATED, EVERY, SHOWN = 90, 2, 15
 #: Place, heading [rad] and shape of each body, the first one in front.
 BODIES = (

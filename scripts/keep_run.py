@@ -1,6 +1,6 @@
-"""Copy finished trainings to the committed results: ``python -m scripts.keep_run runs/walk_rsl_*``.
+"""Copy finished training runs to the committed results: ``python -m scripts.keep_run runs/walk_rsl_*``.
 
-The runs of one call are seeds of one training. The scores of all of them are kept (``results.json``,
+The runs of one call are seeds of one configuration. The scores of all of them are kept (``results.json``,
 ``evaluation.json``), and of the seed with the median return also the policy with its ``config.yaml``: an ordinary
 one, which is what a reader should play. A ``policy.pt`` is copied as it is. Of a ``policy.zip`` of stable-baselines3
 only the actor's parameters are kept, an eighth of the file: enough for ``agents.play``, not for ``PPO.load``.
@@ -31,14 +31,14 @@ def main(
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
     to: Annotated[Path, tyro.conf.arg(help="folder of the results")] = Path("benchmarks/results/ppo"),
 ) -> int:
-    """Copy the seeds of a training into a folder, each under its own name.
+    """Copy the seeds of a training run into a folder, each under its own name.
 
     Args:
-        runs: folders of finished trainings that differ in their seed.
+        runs: folders of finished training runs that differ in their seed.
         to: destination.
 
     Raises:
-        ValueError: there are no runs, or two of one name; a folder holds no finished training, or an unreadable file;
+        ValueError: there are no runs, or two of one name; a folder holds no finished run, or an unreadable file;
             or its name is taken at the destination. Nothing is written then.
     """
     if not runs:

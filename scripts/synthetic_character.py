@@ -1,6 +1,6 @@
 """Write a dressed character with a Mixamo rig as GLB, made from the embedded body (MakeHuman, CC0).
 
-It serves tests, trainings and a first try without a file of one's own: a stout man of 1.7 m in shirt, kilt and
+It serves tests, training runs and a first try without a file of one's own: a stout man of 1.7 m in shirt, kilt and
 tights with a thick cap of hair. Lengths are centimetres, and the axes of the bones point anywhere, as in files of other
 programs::
 

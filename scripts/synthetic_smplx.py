@@ -80,7 +80,7 @@ def _t_pose(data: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _with_hands(places: np.ndarray, parents: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return joints, parents and weights of SMPL, which has one joint a hand, the middle finger's first."""
+    """Return joints, parents and weights of SMPL, which has one joint per hand, the middle finger's first."""
     merged = np.zeros((len(weights), 24))
     merged[:, :NUM_JOINTS] = weights[:, :NUM_JOINTS]
     merged[:, 22], merged[:, 23] = weights[:, 22:37].sum(axis=1), weights[:, 37:].sum(axis=1)

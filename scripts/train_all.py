@@ -42,7 +42,7 @@ def _load_rsl(source: Path | Mapping[str, Any], overrides: Mapping[str, Any] | N
 SCRIPTS = {"rsl_rl": "agents.rsl_rl.train", "sb3": "agents.sb3.train"}
 LOADERS = {"rsl_rl": _load_rsl, "sb3": load_training}
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-#: Interval between two checks of a training [s].
+#: Interval between two checks of a training run [s].
 WAIT = 0.2
 
 
@@ -74,7 +74,7 @@ class Job:
             raise ValueError(f"{path} is of no training of {self.config.stem} ({error}); remove it") from None
         for name, then, now in settings_changed(had, asked):
             raise ValueError(
-                f"{path} is of a training with {name}={then}, now it is {now}; give the same settings, or another "
+                f"{path} is of a training run with {name}={then}, now it is {now}; give the same settings, or another "
                 "folder with --runs"
             )
         longer = any(had[name] < asked[name] for name in LENGTHS if name in asked)
@@ -106,7 +106,7 @@ class Job:
 
 
 def end(process: subprocess.Popen) -> None:
-    """Kill a training and its processes; its checkpoints are written atomically, so none is damaged."""
+    """Kill a training run and its processes; its checkpoints are written atomically, so none is damaged."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError):  # it has ended by itself
             os.killpg(process.pid, signal.SIGKILL)
@@ -118,20 +118,20 @@ def end(process: subprocess.Popen) -> None:
 def main(
     configs: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
     settings: Annotated[tuple[str, ...], tyro.conf.arg(help="settings that override the files': iterations=10")] = (),
-    seeds: Annotated[int, tyro.conf.arg(help="trainings of each configuration")] = 5,
+    seeds: Annotated[int, tyro.conf.arg(help="training runs of each configuration")] = 5,
     gpus: Annotated[tuple[str, ...], tyro.conf.arg(help="numbers of the GPUs to train on; none for the CPU")] = (),
-    jobs_per_device: Annotated[int, tyro.conf.arg(help="trainings at a time on a GPU, or on the CPU")] = 3,
+    jobs_per_device: Annotated[int, tyro.conf.arg(help="training runs at a time on a GPU, or on the CPU")] = 3,
     minutes: Annotated[float | None, tyro.conf.arg(help="stop after so long; the same command goes on")] = None,
-    runs: Annotated[Path, tyro.conf.arg(help="folder of the trainings")] = Path("runs"),
+    runs: Annotated[Path, tyro.conf.arg(help="folder of the training runs")] = Path("runs"),
 ) -> int:
     """Train the configurations named, by default all of ``configs/rsl_rl`` and ``configs/sb3``.
 
     Args:
         configs: names of files there, without the ending.
         settings: for all of them.
-        seeds: trainings of each configuration, from seed 0 on.
+        seeds: training runs of each configuration, from seed 0 on.
         gpus: as ``CUDA_VISIBLE_DEVICES`` names them.
-        jobs_per_device: trainings at a time on a GPU, or on the CPU.
+        jobs_per_device: training runs at a time on a GPU, or on the CPU.
         minutes: after which all are stopped; no limit if not given.
         runs: folder to write to.
 
@@ -139,10 +139,10 @@ def main(
         0 if all have ended, or were stopped for the time; 1 if one failed; 130 if all were stopped by Ctrl-C.
 
     Raises:
-        OSError: the trainings cannot be written there.
+        OSError: the training runs cannot be written there.
         ImportError: a configuration is for an extra that is not installed.
         ValueError: an unknown configuration, a number out of range, a setting that is refused, or a folder with the
-            scores of a training by other settings.
+            scores of a training run by other settings.
     """
     if seeds < 1 or jobs_per_device < 1:
         raise ValueError(f"seeds={seeds}, jobs_per_device={jobs_per_device}: both must be >= 1")
@@ -150,7 +150,7 @@ def main(
         raise ValueError(f"minutes={minutes} must be >= 0")
     jobs = [Job(path, n, runs / f"{path.stem}_{n}") for path in find(configs) for n in range(seeds)]
     for job in jobs:
-        job.is_over(settings)  # refuses settings, and other trainings' folders, before anything begins
+        job.is_over(settings)  # refuses settings, and other training runs' folders, before anything begins
     slots: SimpleQueue[str | None] = SimpleQueue()
     for _ in range(jobs_per_device):
         for gpu in gpus or (None,):
@@ -192,7 +192,7 @@ def find(names: tuple[str, ...]) -> list[Path]:
 
 
 def as_by_ctrl_c(*_: object) -> None:
-    """Raise KeyboardInterrupt, so that trainings end with the terminal or at the system's request."""
+    """Raise KeyboardInterrupt, so that training runs end with the terminal or at the system's request."""
     raise KeyboardInterrupt
 
 

@@ -2,7 +2,7 @@
 
 Writes a Minari dataset such as ``piavatar/walk/expert-v0`` below the folder; with that folder in the variable
 ``MINARI_DATASETS_PATH``, ``minari.load_dataset`` loads it by this name. Episodes are complete, and their seeds are
-those of trainings: evaluations play others.
+those of training runs: evaluations play others.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Options:
     num_envs: int = 256
     #: where to simulate
     device: str = "cpu"
-    #: folder of a training of your own, whose policy plays instead
+    #: folder of a training run of your own, whose policy plays instead
     run: Path | None = None
     #: standard deviation of noise on its actions, instead of the level's
     noise: float | None = None

@@ -75,8 +75,8 @@ def open_source(
     Args:
         env_id: registered id.
         level: of :data:`LEVELS`.
-        settings: assignments that win over those of the expert's environment, as ``fidelity=tiny``.
-        run: folder of another training whose policy plays instead.
+        settings: assignments that override those of the expert's environment, as ``fidelity=tiny``.
+        run: folder of another training run whose policy plays instead.
         noise: standard deviation of the noise on its actions, instead of the level's.
 
     Raises:
@@ -90,7 +90,7 @@ def open_source(
     load_task(env_id)
     known = PLAYERS.get(env_id)
     if run is None and known is None:
-        raise ConfigError(f"{env_id} has no committed expert; name a training of your own with --run FOLDER")
+        raise ConfigError(f"{env_id} has no committed expert; name a training run of your own with --run FOLDER")
     reference = run or _folder(known["expert"])
     task = _task(env_id, reference, settings)
     if level == "random":

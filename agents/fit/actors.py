@@ -1,4 +1,4 @@
-"""Actors of trials: scripted ones, whose actions depend on time and seed alone, and policies of trainings."""
+"""Actors of trials: scripted ones, whose actions depend on time and seed alone, and policies of training runs."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class _Script:
 
 
 def _trained(config: ActorConfig, host: EpisodeHost) -> Actor:
-    """Load the policy of a training for a batch.
+    """Load the policy of a training run for a batch.
 
     Raises:
         ConfigError: it was trained for other actions or observations.

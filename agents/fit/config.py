@@ -46,7 +46,7 @@ class ActorConfig(BaseModel):
     kind: Literal["zero", "random", "keyframes", "run"] = Field(
         "zero",
         description="zero (keeps the commanded pose), random (drawn from the episode's seed), keyframes (a script) or "
-        "run (the policy that a training has left)",
+        "run (the policy that a training run has left)",
     )
     keyframes: tuple[Keyframe, ...] = Field((), description="of the script, in the order of their times")
     run: Path | None = Field(None, strict=False, description="folder of the training")
@@ -110,7 +110,7 @@ def load_fit(source: Mapping[str, Any] | str | Path, overrides: Mapping[str, Any
 
     Args:
         source: a YAML file or a mapping.
-        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment,
+        overrides: settings that override it, as from a command line; ``env.NAME`` for those of the environment,
             ``scorers.KIND.NAME`` for those of a scorer, ``parameters.NAME.low`` for a bound.
 
     Raises:

@@ -36,7 +36,7 @@ class Options:
     config: tyro.conf.Positional[Path]
     #: recording to write, .npz
     file: tyro.conf.Positional[Path]
-    #: settings of the study that win over the file's: env.fidelity=tiny
+    #: settings of the study that override the file's: env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: value of every parameter, as scene.props.0.mass=3.5
     values: tuple[str, ...] = ()

@@ -58,7 +58,7 @@ class Episode:
 
     Attributes:
         seed: of the episode.
-        readings: by name, the reset's first and then one entry a control step, shape ``(steps + 1, ...)``.
+        readings: by name, the reset's first and then one entry per control step, shape ``(steps + 1, ...)``.
         pictures: frames ``(count, height, width, 3)`` uint8, evenly spaced in time; None where none are wanted.
         failure: name of the simulation's failure, or an empty string.
     """

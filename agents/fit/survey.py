@@ -114,7 +114,7 @@ class Options:
 
     #: YAML files of studies with one parameter each, a question each
     configs: tyro.conf.Positional[tuple[Path, ...]] = ()
-    #: settings that win over those of all files: --settings env.fidelity=coarse
+    #: settings that override those of all files: --settings env.fidelity=coarse
     settings: tuple[str, ...] = ()
     #: folder of the survey
     out: Path = Path("runs") / "survey"

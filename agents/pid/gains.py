@@ -1,6 +1,6 @@
 """Gains of a PID by joint, by what it carries or how strong it is, and a schedule that scales them by the load on legs.
 
-A schedule is anything that is called with what it depends on, a row an environment, and returns factors
+A schedule is anything that is called with what it depends on, a row per environment, and returns factors
 ``(n, joints, 1)`` for :meth:`agents.pid.controller.PosePID.step`. Factors of several schedules are multiplied.
 """
 

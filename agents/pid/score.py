@@ -1,7 +1,7 @@
 """Scores of the PID agent on a task: ``python -m agents.pid.score PIAvatar/Stand-v0 --film stand.gif``.
 
 Plays the episodes that trained agents are evaluated in, beside zero and random torques, and leaves ``results.json``,
-which ``agents.scores`` takes as it takes those of trainings.
+which ``agents.scores`` takes as it takes those of training runs.
 """
 
 from __future__ import annotations

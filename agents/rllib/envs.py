@@ -1,4 +1,4 @@
-"""Environments of a training with RLlib, built by its env runners: a batch of single avatars, or a game."""
+"""Environments of a training run with RLlib, built by its env runners: a batch of single avatars, or a game."""
 
 from __future__ import annotations
 

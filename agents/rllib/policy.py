@@ -1,4 +1,4 @@
-"""Policies of RLlib's PPO: the settings of their trainings, their networks, and agents out of files.
+"""Policies of RLlib's PPO: the settings of their training runs, their networks, and agents out of files.
 
 Nothing here needs RLlib: its default module is a plain network, and ``policy.pt`` holds its parameters.
 """
@@ -60,7 +60,7 @@ class RLlibPPOSettings(BaseModel):
 
 
 class RLlibTraining(BatchTraining):
-    """Settings of a training with RLlib."""
+    """Settings of a training run with RLlib."""
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id, or a module of piavatar_envs.multi")
     num_envs: int = Field(16, ge=1, le=MOST_ENVS, description="environments of every env runner")
@@ -74,7 +74,7 @@ class RLlibTraining(BatchTraining):
 
     @model_validator(mode="after")
     def _check_seeds(self) -> RLlibTraining:
-        """Refuse more environments than a training has seeds."""
+        """Refuse more environments than a training run has seeds."""
         if self.total_envs > MOST_ENVS:
             raise ConfigError(
                 f"env_runners={self.env_runners} with num_envs={self.num_envs} are {self.total_envs} environments, at "

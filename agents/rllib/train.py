@@ -1,10 +1,10 @@
 """PPO by RLlib, on one machine or several: ``python -m agents.rllib.train configs/rllib/reach_rllib.yaml``.
 
-Starts Ray on this machine, or joins the cluster that ``RAY_ADDRESS`` names. A lost machine does not end a training: env
-runners that are left play all steps, and lost ones are restarted where there are CPUs for them. Leaves in the folder:
-the resolved configuration, the policies, a checkpoint, the learning curve, ``progress.csv`` with the env runners at
-work and the restarts of every iteration, and the evaluation. ``--resume`` restores networks and optimizers; the
-episodes begin anew.
+Starts Ray on this machine, or joins the cluster that ``RAY_ADDRESS`` names. A lost machine does not end the training:
+env runners that are left play all steps, and lost ones are restarted where there are CPUs for them. Leaves in the
+folder: the resolved configuration, the policies, a checkpoint, the learning curve, ``progress.csv`` with the env
+runners at work and the restarts of every iteration, and the evaluation. ``--resume`` restores networks and optimizers;
+the episodes begin anew.
 
 Ray takes seconds to import, so command lines are read and refused before.
 """
@@ -136,7 +136,7 @@ def start_ray(config: RLlibTraining) -> None:
 
 
 class Trainer:
-    """A training: RLlib's algorithm, its checkpoint and its curve.
+    """A training run: RLlib's algorithm, its checkpoint and its curve.
 
     Attributes:
         algorithm: RLlib's.

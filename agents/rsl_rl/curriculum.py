@@ -203,7 +203,7 @@ class CurriculumEnv(AvatarRslEnv):
     """Environments that adapt while an agent learns; evaluations do without.
 
     Attributes:
-        steps: control steps of every environment so far; to be set when a training resumes.
+        steps: control steps of every environment so far; to be set when a training run resumes.
         rollout_steps: of them in a rollout.
         ranks: of the training; each has such environments.
         curricula: by name, see :data:`CURRICULA`.

@@ -1,4 +1,4 @@
-"""Policies of rsl_rl's PPO: the settings of their trainings, their networks, and agents out of files."""
+"""Policies of rsl_rl's PPO: the settings of their training runs, their networks, and agents out of files."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class RslPPOSettings(BaseModel):
 
 
 class RslTraining(BatchTraining):
-    """Settings of a training with rsl_rl.
+    """Settings of a training run with rsl_rl.
 
     Class attributes:
         obs_modes: what the networks take.

@@ -28,7 +28,7 @@ class ScaledPPO(PPO):
     What is logged are the environment's own rewards.
 
     Attributes:
-        updates: how many there have been; to be set where a training goes on.
+        updates: how many there have been; to be set where a training run goes on.
         check: is called after each, also after one that torch has refused to end; to be set.
         learned: is called after each that has ended, by all ranks; to be set.
     """

@@ -1,8 +1,8 @@
 """PPO by rsl_rl on a batch of environments: ``python -m agents.rsl_rl.train configs/rsl_rl/reach_rsl.yaml``.
 
 Writes to the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's own saved networks, the
-learning curve, and the evaluation. A killed training continues with ``--resume`` from the latest checkpoint, with the
-same results as without the interruption. ``torchrun --nproc-per-node=2 -m agents.rsl_rl.train ...`` trains on two GPUs.
+learning curve, and the evaluation. A killed run continues with ``--resume`` from the latest checkpoint, with the same
+results as without the interruption. ``torchrun --nproc-per-node=2 -m agents.rsl_rl.train ...`` trains on two GPUs.
 """
 
 from __future__ import annotations

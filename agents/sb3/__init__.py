@@ -1,1 +1,1 @@
-"""Trainings with stable-baselines3: PPO, SAC, worlds of several agents and self-play."""
+"""Training runs with stable-baselines3: PPO, SAC, worlds of several agents and self-play."""

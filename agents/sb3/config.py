@@ -24,7 +24,7 @@ MOST_PROCESSES = 256
 
 
 class TrainingConfig(BaseModel):
-    """Settings of a training with stable-baselines3."""
+    """Settings of a training run with stable-baselines3."""
 
     model_config = FROZEN
 

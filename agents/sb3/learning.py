@@ -1,6 +1,6 @@
 """Learning with stable-baselines3: begin or resume, log episodes, write checkpoints and policies.
 
-What a training with stable-baselines3 depends on, taken out of a model and put back.
+What a training run with stable-baselines3 depends on, taken out of a model and put back.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from agents.sb3.workers import EnvFacts, components
 from piavatar_envs.api.sb3 import SB3VecEnv
 from piavatar_envs.config import ConfigError
 
-#: Returns the end of a training by ``time.monotonic()``, given the steps and the seconds [s] that it has had.
+#: Returns the end of a training run by ``time.monotonic()``, given the steps and the seconds [s] that it has had.
 Deadline = Callable[[int, float], float]
 
 
@@ -148,7 +148,7 @@ def learn(
         config: resolved.
         model: from :func:`begin`, with the same checkpoint.
         folder: where to write; exists.
-        checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
+        checkpoint: from which to go on, and which to keep up; None for a training run that cannot be resumed.
         deadline: when to end before all steps, or None.
         watchers: what else to call at every step, before the checkpoint is written.
 
@@ -228,7 +228,7 @@ _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "done
 
 
 def capture(model: BaseAlgorithm, curve: Curve) -> dict[str, Any]:
-    """Return everything that the rest of a training depends on, between two rollouts."""
+    """Return everything that the rest of a training run depends on, between two rollouts."""
     monitor = _monitor(model)
     modules, variables = model._get_torch_save_params()
     return {

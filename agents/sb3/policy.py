@@ -1,4 +1,4 @@
-"""Agents out of what trainings with stable-baselines3 leave."""
+"""Agents out of what training runs with stable-baselines3 leave."""
 
 from __future__ import annotations
 

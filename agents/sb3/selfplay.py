@@ -150,7 +150,7 @@ def enter(
         venv: the worlds, reset afterwards.
         model: untrained.
         folder: of the run; the pool is in its folder ``pool``.
-        steps: of the snapshots of a training that goes on.
+        steps: of the snapshots of a training run that goes on.
 
     Raises:
         ConfigError: one of them has no file.

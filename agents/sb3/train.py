@@ -52,7 +52,7 @@ def train(
         venv: the workers, or the learning agents of their worlds.
         facts: of their environment.
         folder: where to write; exists.
-        checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
+        checkpoint: from which to go on, and which to keep up; None for a training run that cannot be resumed.
         deadline: when to end before all steps, or None.
 
     Raises:
@@ -105,7 +105,7 @@ class Options:
 
     #: YAML file with what differs from the defaults
     config: tyro.conf.Positional[Path]
-    #: settings that win over the file: total_steps=1000 env.fidelity=tiny ppo.discount=0.95
+    #: settings that override the file: total_steps=1000 env.fidelity=tiny ppo.discount=0.95
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: folder to write to; by default runs/ and the name of the file
     out: Path | None = None
@@ -116,7 +116,7 @@ class Options:
 
 
 def run(config: TrainingConfig, folder: Path, device: str, resume: bool, again: str) -> None:
-    """Train, or resume a training, and evaluate.
+    """Train, or resume a training run, and evaluate.
 
     Args:
         config: resolved.
@@ -126,7 +126,7 @@ def run(config: TrainingConfig, folder: Path, device: str, resume: bool, again: 
         again: command line that resumes this training.
 
     Raises:
-        ConfigError: the folder is another training's, the checkpoint does not fit, or the configuration does not fit
+        ConfigError: the folder is another run's, the checkpoint does not fit, or the configuration does not fit
             the environment or the device.
         Diverged: the networks are not finite any more.
         OSError: something cannot be written.

@@ -45,7 +45,7 @@ class EnvFactory:
 
 
 def factory(config: TrainingConfig, device: str = "cpu") -> EnvFactory | WorldFactory:
-    """Return the factory of a training's environments: of worlds, where there are several agents."""
+    """Return the factory of a training run's environments: of worlds, where there are several agents."""
     if config.is_multi:
         return WorldFactory(multi_game(config.env_id).name, dict(config.env), device)
     return EnvFactory(config.env_id, dict(config.env), device)

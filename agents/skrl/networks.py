@@ -1,4 +1,4 @@
-"""Networks and memory of a training with skrl: policies of what an agent sees, critics of what all see."""
+"""Networks and memory of a training run with skrl: policies of what an agent sees, critics of what all see."""
 
 from __future__ import annotations
 

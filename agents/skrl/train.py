@@ -41,7 +41,7 @@ _OPTIONAL = ("learning_rate_scheduler", "observation_preprocessor", "state_prepr
 
 
 class MAPPOTraining(BatchTraining):
-    """Settings of a training with MAPPO."""
+    """Settings of a training run with MAPPO."""
 
     env_id: str = Field("high_five_v0", description="module of piavatar_envs.multi")
     mappo: MAPPOSettings = Field(default_factory=MAPPOSettings, description="the algorithm")
@@ -181,7 +181,7 @@ class WorldMAPPO(MAPPO):
             yield name, {part: module for part, module in modules.items() if hasattr(module, "state_dict")}
 
     def resume(self) -> None:
-        """Restore the checkpoint of a training, if there is one; call it after everything that draws random numbers."""
+        """Restore the checkpoint, if there is one; call it after everything that draws random numbers."""
         saved = self.checkpoint.state if self.checkpoint else None
         if saved is None:
             return

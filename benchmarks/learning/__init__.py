@@ -1,1 +1,1 @@
-"""Scores of agents and of short trainings."""
+"""Scores of agents and of short training runs."""

@@ -36,7 +36,7 @@ class Options(runner.Options):
     seeds: int = 3
     #: folder for the policies and learning curves
     folder: Path = Path("runs/reach_ppo")
-    #: settings that win over configs/sb3/reach_ppo.yaml, such as total_steps=1000
+    #: settings that override configs/sb3/reach_ppo.yaml, such as total_steps=1000
     settings: tuple[str, ...] = ()
 
 

@@ -23,7 +23,7 @@ from benchmarks.paper.supplement import write_meshes
 
 FOLDER = Path(__file__).resolve().parents[1] / "results" / "figures"
 PANEL = 400  # width of the curve [px]
-FILM, FILM_RATE = 300, 15  # size of a film [px], and pictures a second
+FILM, FILM_RATE = 300, 15  # size of a film [px], and pictures per second
 TITLE = 27  # height of a title [px]
 PALETTE = 256  # of a PNG: a quarter of the size, without a visible difference
 COLORS = ("#1b7f79", "#d1495b", "#8d6a9f", "#e0a030", "#3b6fb6", "#555555")
@@ -202,7 +202,7 @@ def figures() -> dict[str, Figure]:
             lambda folder: [acts.crowd(write_meshes(folder)[0])],
             ("",),
             measures.crowd,
-            partial(over_time, label="impulse a step [N s]"),
+            partial(over_time, label="impulse per step [N s]"),
             curves.impulses,
             film=1.0,
         ),
@@ -233,7 +233,7 @@ def figures() -> dict[str, Figure]:
             lambda _: [act for index, act in enumerate(acts.pillows()) if index != 1],
             ("1 kPa", "5 kPa", "100 kPa"),
             measures.pillow,
-            partial(over_time, label="impulse a step [N s]"),
+            partial(over_time, label="impulse per step [N s]"),
             lambda course: {"": curves.impulses(course)["pillow"]},
             columns=True,
         ),

@@ -73,7 +73,7 @@ class Rig:
     """``num_envs`` bodies of given shapes, at rest in the rest pose.
 
     Attributes:
-        points: the particles (NumPy), a row a body.
+        points: the particles (NumPy), a row per body.
         flesh: particles that track no bone, shape ``(P,)`` bool.
     """
 

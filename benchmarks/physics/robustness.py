@@ -26,7 +26,7 @@ class Options(runner.Options):
 
     #: environment steps in all, spread evenly over environments and seeds
     steps: int = 10_000
-    #: seeds an environment
+    #: seeds per environment
     seeds: int = 20
     #: resolution of the body
     fidelity: str = "coarse"

@@ -101,7 +101,7 @@ def summarize(name: str, results: list[dict[str, Any]], core: int | None) -> dic
 
 
 def measure(name: str, steps: int, repeats: int, core: int | None) -> dict[str, Any]:
-    """Measure environment steps a second under full-scale random actions, through ``gym.make``."""
+    """Measure environment steps per second under full-scale random actions, through ``gym.make``."""
     pin(core)
     prepare(name)
     imports = peak_memory_mb()

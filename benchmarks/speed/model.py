@@ -1,7 +1,7 @@
 """Cost of a batch that was not measured: time of a control step, memory, and network traffic of data-parallel PPO.
 
 ``python -m benchmarks.speed.model --world PIAvatar/KickBall-v0 --num-envs 1000000 --gpus 64``. The constants come from
-the committed results of :mod:`benchmarks.speed.vector`, :mod:`benchmarks.speed.pixels` and a training, all on one
+the committed results of :mod:`benchmarks.speed.vector`, :mod:`benchmarks.speed.pixels` and a training run, all on one
 H200; the formulas are in ``docs/scaling.md``.
 """
 
@@ -105,7 +105,7 @@ def drawing_us(size: int) -> float:
 def learner_us() -> float:
     """Return the time that PPO takes for an environment step in one epoch of a rollout [us].
 
-    It is what a training took beyond its simulation, for networks of 512, 256 and 128 units.
+    It is what a training run took beyond its simulation, for networks of 512, 256 and 128 units.
     """
     run = json.loads((RESULTS / TRAINING / "results.json").read_text(encoding="utf-8"))
     steps, batch = run["train_steps"], run["num_envs"]

@@ -66,7 +66,7 @@ def build(world: str, num_envs: int, settings: list[str], options: Options) -> E
 
 
 def speed_without(world: str, num_envs: int, options: Options) -> float:
-    """Measure environment steps a second without pictures."""
+    """Measure environment steps per second without pictures."""
     gc.collect()  # what the batch before has left
     settings = [setting for setting in options.settings if not setting.startswith("pixels.")]
     (batch,) = build(world, num_envs, settings, options).groups

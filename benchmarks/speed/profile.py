@@ -1,7 +1,7 @@
 """Time and launches of every kernel of a control step.
 
 ``python -m benchmarks.speed.profile --device cuda --num-envs 4096 --out benchmarks/results/profile_reach.json``
-writes a row a kernel and draws ``profile_reach.png`` beside it. The kernels are launched one by one to be timed; the
+writes a row per kernel and draws ``profile_reach.png`` beside it. The kernels are launched one by one to be timed; the
 first row has the captured step as a whole, which is what counts.
 """
 

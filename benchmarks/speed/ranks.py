@@ -1,7 +1,7 @@
-"""Speed of a training on one and several GPUs, and its time to a share of successes.
+"""Speed of a training run on one and several GPUs, and its time to a share of successes.
 
 ``python -m benchmarks.speed.ranks --device cuda --ranks 1 2 4 --out benchmarks/results/ranks.json``. Every row is a
-training by torchrun and rsl_rl, in which each rank has as many environments as the configuration says, so that the
+training run by torchrun and rsl_rl, in which each rank has as many environments as the configuration says, so that the
 batch grows with the ranks. A row has
 
 - ``env_steps_per_s``: of training, over all ranks: control steps of a rollout by the median time of an iteration;
@@ -41,13 +41,13 @@ class Options(runner.Options):
 
     #: numbers of ranks: processes, each with a GPU of its own
     ranks: tuple[int, ...] = (1,)
-    #: configuration of a training by rsl_rl
+    #: configuration of a training run by rsl_rl
     config: Path = ROOT / "configs" / "rsl_rl" / "kick_ball_rsl.yaml"
-    #: settings that win over it, such as num_envs=1024
+    #: settings that override it, such as num_envs=1024
     settings: tuple[str, ...] = ()
     #: iterations of a measurement of speed
     iterations: int = 20
-    #: share of successful episodes to be reached in a training as long as the configuration says; none for speed alone
+    #: share of successful episodes to be reached by a run as long as the configuration says; none for speed alone
     success: float | None = None
 
 

@@ -1,4 +1,4 @@
-"""Environment steps a second and memory of an environment, for batches of one to thousands.
+"""Environment steps per second and memory of an environment, for batches of one to thousands.
 
 ``python -m benchmarks.speed.vector --device cuda --out benchmarks/results/vector.json``. Full-scale random actions are
 written on the device; episodes that end begin anew. A row has three speeds:
@@ -136,7 +136,7 @@ class Trainer:
 
 
 def rates(step: Callable[[], None], num_envs: int, options: Options) -> np.ndarray:
-    """Measure environment steps a second in each repeat; shape ``(repeats,)``."""
+    """Measure environment steps per second in each repeat; shape ``(repeats,)``."""
     device = options.device
     timing.wall_times(device, step, WARM_UP)  # captures the graphs, compiles what there is
     once = float(np.median(timing.wall_times(device, step, WARM_UP)))

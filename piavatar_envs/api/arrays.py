@@ -60,7 +60,7 @@ class ArrayApi(Protocol):
         ...
 
     def shown(self, values: Array, mask: Array | None = None) -> Array:
-        """Convert ``values`` (a row an environment) to the type that views return; zeros outside ``mask``."""
+        """Convert ``values`` (a row per environment) to the type that views return; zeros outside ``mask``."""
         ...
 
     def repeated(self, mask: Array | None, num_envs: int, count: int) -> Array:

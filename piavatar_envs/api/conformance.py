@@ -77,9 +77,9 @@ def check_task(
         config: settings as a mapping, a YAML file or a configuration.
         reward_range: lower and upper bound of the reward, of every agent; not checked if not given.
         constant: names of the task's observation terms that may be constant.
-        fidelity: of the bodies; wins over ``config``.
+        fidelity: of the bodies; overrides ``config``.
         seed: of the first environment.
-        **overrides: settings that win over ``config``.
+        **overrides: settings that override ``config``.
 
     Raises:
         TaskError: the task breaks the contract; lists all breaches.

@@ -55,9 +55,9 @@ class AvatarEnv(SingleView, gym.Env):
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
-            max_episode_steps: control steps until truncation; wins over ``episode_seconds``.
+            max_episode_steps: control steps until truncation; overrides ``episode_seconds``.
             registered: set by Gymnasium only: the id, and the task that it is registered for.
-            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+            **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.

@@ -115,7 +115,7 @@ class EpisodeHost:
         check_count("num_envs", num_envs)
         check_mosaic(task.config.render.mosaic, num_envs)
         if num_threads is not None:
-            check_count("num_threads", num_threads, ", or None for one a core")
+            check_count("num_threads", num_threads, ", or None for one per core")
         device = check_device(device)
         self.api = find_array_api(array_api, device)
         threads = min(num_threads or available_cores(), num_envs) if wp.get_device(device).is_cpu else 1
@@ -151,7 +151,7 @@ class EpisodeHost:
 
     @property
     def frame_rate(self) -> float:
-        """Control steps a second; an integer where it is whole, but for the rounding of ``control_dt``."""
+        """Control steps per second; an integer where it is whole, but for the rounding of ``control_dt``."""
         rate = 1.0 / self.config.physics.control_dt
         return round(rate) if abs(rate - round(rate)) < 1e-6 * rate else rate
 
@@ -400,7 +400,7 @@ class EpisodeHost:
     # infos
 
     def status(self, agent: int) -> dict[str, Array]:
-        """Return the part of an agent's info that holds at any time, a row an environment.
+        """Return the part of an agent's info that holds at any time, a row per environment.
 
         ``failure`` is a code, see :func:`piavatar_envs.failure_name`.
         """
@@ -419,7 +419,7 @@ class EpisodeHost:
         }
 
     def outcome(self, agent: int) -> dict[str, Array]:
-        """Return the part of an agent's info that is of the last step, a row an environment.
+        """Return the part of an agent's info that is of the last step, a row per environment.
 
         That is metrics, the terms of the reward as ``reward_<name>``, ``cost`` and its terms as ``cost_<name>``.
         """
@@ -618,7 +618,7 @@ class Transition:
         truncated: ``(num_envs, num_agents)`` bool, the clock has run out for an agent that was still in.
         ended: ``(num_envs,)`` bool, the next episode has begun: the last agent is out, or the clock has run out.
         acted: ``(num_envs, num_agents)`` bool, agents that were in when the step began.
-        infos: of every agent, a row an environment, as they were when the step ended.
+        infos: of every agent, a row per environment, as they were when the step ended.
     """
 
     observation: Array
@@ -767,7 +767,7 @@ class HostView:
         self.host.apply_force(target, force, point, steps, agent, envs)
 
     def read(self, name: str, agent: str | None = None) -> Array:
-        """Return a copy of a quantity of the world by name, a row an environment; docs/scenes.md lists them.
+        """Return a copy of a quantity of the world by name, a row per environment; docs/scenes.md lists them.
 
         Quaternions are ``wxyz``. The names are those of :data:`piavatar_envs.api.readings.READINGS`.
 

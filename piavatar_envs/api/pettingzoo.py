@@ -61,7 +61,7 @@ class AvatarParallelEnv(SingleView, ParallelEnv):
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
-            max_cycles: control steps until truncation; wins over ``episode_seconds``.
+            max_cycles: control steps until truncation; overrides ``episode_seconds``.
             name: of the environment in its ``metadata``; that of the task's module if not given.
             **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 

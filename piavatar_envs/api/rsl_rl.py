@@ -69,7 +69,7 @@ class AvatarRslEnv(HostView, VecEnv):
                 ``segmentation``.
             seed: environment ``i`` plays the episodes of ``seed + i``; without one they differ every time.
             num_threads: threads on a CPU; as many as there are cores if not given.
-            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+            **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range, or an unknown
@@ -170,7 +170,7 @@ class AvatarRslEnv(HostView, VecEnv):
         Returns:
             Observations by group; reward and done (int64), each ``(num_envs,)``; and extras: ``time_outs``
             ``(num_envs,)`` bool, ``log`` (means of success, metrics and the reward's terms), ``final_observations``
-            (to which the step led, also where an environment was reset), and ``info``, a row an environment.
+            (to which the step led, also where an environment was reset), and ``info``, a row per environment.
 
         Raises:
             ValueError: actions of a wrong shape, type or device; nothing has changed then.

@@ -54,10 +54,10 @@ class SB3VecEnv(VecEnv):
             render_mode: None or ``"rgb_array"``.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``; the arrays are NumPy's either way.
             config: settings as a mapping, a YAML file or a configuration.
-            num_threads: threads that share the environments on a CPU; one a core if not given.
+            num_threads: threads that share the environments on a CPU; one per core if not given.
             step_infos: whether every step has infos, or only the last one of an episode. A thousand dictionaries a
                 step cost more than the thousand environments on a GPU.
-            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+            **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
@@ -132,7 +132,7 @@ class SB3VecEnv(VecEnv):
         return observation, reward.astype(np.float32), ended, rows
 
     def assist_root(self, share: float | np.ndarray) -> None:
-        """Set the share of root assistance from now on: one in [0, 1], or one an environment; resets keep it.
+        """Set the share of root assistance from now on: one in [0, 1], or one per environment; resets keep it.
 
         Raises:
             ValueError: it is out of range, of another shape, or the control is ``"pose"``.

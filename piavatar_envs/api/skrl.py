@@ -1,4 +1,4 @@
-"""Views for skrl's wrappers: dictionaries of torch tensors, a row an environment. Needs torch.
+"""Views for skrl's wrappers: dictionaries of torch tensors, a row per environment. Needs torch.
 
 One avatar::
 
@@ -91,7 +91,7 @@ class AvatarSkrlEnv(_TorchView):
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
             num_threads: threads on a CPU; as many as there are cores if not given.
-            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+            **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
@@ -138,7 +138,7 @@ class AvatarSkrlEnv(_TorchView):
         Returns:
             ``{"policy": observation}``, then reward, terminated and truncated, each ``(num_envs,)``, and the info:
             beside the final observation the entries of Gymnasium's view (metrics, ``reward_<name>``, ``success``,
-            ``failure``, ...), a row an environment.
+            ``failure``, ...), a row per environment.
 
         Raises:
             ValueError: actions of a wrong shape, type or device; nothing has changed then.
@@ -206,7 +206,7 @@ class AvatarSkrlMultiEnv(_TorchView):
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
             num_threads: threads on a CPU; as many as there are cores if not given.
-            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+            **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.

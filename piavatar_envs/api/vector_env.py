@@ -251,10 +251,10 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
             config: settings as a mapping, a YAML file or a configuration.
             array_api: kind of arrays: ``"numpy"`` or ``"torch"`` (on ``device``).
             autoreset_mode: an ``AutoresetMode`` or its value, see above.
-            num_threads: threads that share the environments on a CPU; one a core if not given. Changes no result.
-            max_episode_steps: control steps until truncation; wins over ``episode_seconds``.
+            num_threads: threads that share the environments on a CPU; one per core if not given. Changes no result.
+            max_episode_steps: control steps until truncation; overrides ``episode_seconds``.
             registered: set by Gymnasium only: the id, and the task that it is registered for.
-            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+            **overrides: settings that override ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown (a TypeError, too), of the wrong type or out of range.
@@ -409,7 +409,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
         return host.api.shown(host.reward()[:, 0]), host.terminated()[:, 0], host.truncated()
 
     def _info(self, stepped: Array | None = None, outcome: dict[str, Array] | None = None) -> dict[str, Array]:
-        """Return the infos, a row an environment; the outcome of the last step is zero where ``stepped`` is False."""
+        """Return the infos, a row per environment; the outcome of the last step is zero where ``stepped`` is False."""
         host = self.host
         outcome = host.outcome(0) if outcome is None else outcome
         if stepped is not None:
@@ -460,7 +460,7 @@ class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
 
 
 def single_infos(infos: Mapping[str, Any], num_envs: int) -> list[dict[str, Any]]:
-    """Split infos in vector format into one dictionary an environment, of the values that the masks grant it."""
+    """Split infos in vector format into one dictionary per environment, of the values that the masks grant it."""
     rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
     for name, mask in infos.items():
         if not name.startswith("_") or name[1:] not in infos:

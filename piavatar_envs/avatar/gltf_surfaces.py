@@ -216,7 +216,7 @@ class _Reader:
             self._arrays[index] = self.gltf.accessor(index)
         found = self._arrays[index]
         if found.shape[1] != width:
-            raise ValueError(f"{what} has {found.shape[1]} numbers a vertex, it must have {width}")
+            raise ValueError(f"{what} has {found.shape[1]} numbers per vertex, it must have {width}")
         return found
 
     def piece(self, index: int, node: dict[str, Any], name: str, primitive: dict[str, Any]) -> Piece:

@@ -305,7 +305,7 @@ class Skin:
         if len(counts) != 1 or 0 in counts:
             raise ValueError(
                 f"rest_positions, skin_joints and skin_weights have {len(rest_positions)}, {len(skin_joints)} and "
-                f"{len(skin_weights)} rows; give one row a particle, and at least one particle"
+                f"{len(skin_weights)} rows; give one row per particle, and at least one particle"
             )
         self._rest, self._particles = np.asarray(body.vertices, np.float64), np.asarray(rest_positions, np.float64)
         self._rest_joints = np.asarray(body.joints, np.float64)
@@ -327,7 +327,7 @@ class Skin:
         skin_weights: np.ndarray,
         correctives: PoseCorrectives | None = None,
     ) -> Skin:
-        """Return the skin of these arrays, baked once a process for all environments; arguments as for the class."""
+        """Return the skin of these arrays, baked once per process for all environments; arguments as for the class."""
         digest = hashlib.blake2b()
         surface = (asset.skin_joints, asset.skin_weights, body.vertices, body.joints)
         pose: PoseDisplacements | None = getattr(asset, "pose", None)

@@ -50,7 +50,7 @@ def in_order(joints: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def pack(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Pack bones and weights of :func:`in_order` into ``(N, 4)`` float32: three weights, then a byte a bone."""
+    """Pack bones and weights of :func:`in_order` into ``(N, 4)`` float32: three weights, then a byte per bone."""
     bones = (joints.astype(np.uint32) << (8 * np.arange(4, dtype=np.uint32))).sum(axis=1, dtype=np.uint32)
     return np.column_stack([weights[:, 1:], bones.view(np.float32)])
 

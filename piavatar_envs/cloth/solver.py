@@ -1,4 +1,4 @@
-"""The cloth of a world: all garments of an environment as one mesh, advanced by one launch a control step."""
+"""The cloth of a world: all garments of an environment as one mesh, advanced by one launch per control step."""
 
 from __future__ import annotations
 

@@ -227,14 +227,16 @@ def _count(node: yaml.Node, counted: dict[yaml.Node, int | None]) -> int:
 
 
 def _read_settings(cls: type[BaseModel], path: Path) -> Mapping[str, Any]:
-    """Read a YAML file of settings, but refuse that of a training where those of an environment are expected.
+    """Read a YAML file of settings, but refuse that of a training run where those of an environment are expected.
 
     Raises:
         ConfigError: as :func:`read_yaml`, or the file is that of a training.
     """
     content = read_yaml(path)
     if "env_id" in content and "env_id" not in cls.model_fields:
-        raise ConfigError(f"{path} is the file of a training; settings of its environment are those under its key env")
+        raise ConfigError(
+            f"{path} is the file of a training run; settings of its environment are those under its key env"
+        )
     return content
 
 

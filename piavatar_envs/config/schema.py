@@ -141,7 +141,7 @@ class PhysicsConfig(BaseModel):
     )
     control_dt: float = Field(1.0 / 30.0, ge=1.0e-4, le=0.2, description="time between two actions [s]")
     num_substeps: int | None = Field(
-        None, ge=1, le=MOST_SUBSTEPS, description="substeps a control step; null chooses them from the CFL limit"
+        None, ge=1, le=MOST_SUBSTEPS, description="substeps per control step; null chooses them from the CFL limit"
     )
     cfl: float = Field(
         0.5,
@@ -844,7 +844,7 @@ class EnvConfig(BaseModel):
 
     preset: Literal["firm", "soft", "limp"] | None = Field(
         None,
-        description="settings of body and joints in one word, over which given settings win: firm (young_modulus 1e5, "
+        description="settings of body and joints in one word, which given settings override: firm (young_modulus 1e5, "
         "tone or joint_stiffness 1), soft (2e4, tone 0.1 or joint_stiffness 0.3), limp (2e4 and 0); null sets nothing",
     )
     physics: PhysicsConfig = Field(default_factory=PhysicsConfig, description="the continuum")

@@ -3,7 +3,7 @@
 Nothing is allocated, decided or synchronised while a graph runs, so a step costs its kernels and little more.
 
 Kernels missing from Warp's cache are compiled before the first run. That takes seconds a module, and a world has
-dozens of modules: :func:`compile_graphs` compiles them in parallel, one a core.
+dozens of modules: :func:`compile_graphs` compiles them in parallel, one per core.
 """
 
 from __future__ import annotations
@@ -342,5 +342,5 @@ def available_cores() -> int:
 
 
 def compiling_threads() -> int:
-    """Return the number of threads that compile kernels: one a core, at most :data:`MAX_COMPILING_THREADS`."""
+    """Return the number of threads that compile kernels: one per core, at most :data:`MAX_COMPILING_THREADS`."""
     return min(MAX_COMPILING_THREADS, available_cores())

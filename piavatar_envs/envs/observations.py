@@ -53,7 +53,7 @@ SELF_TERMS: tuple[ObservationTerm, ...] = (
     ObservationTerm("root_height", 1, "m", "world", "height of the pelvis joint"),
     ObservationTerm("root_orientation", 6, "-", "world", "first two columns of the pelvis' rotation matrix"),
     ObservationTerm(
-        "joint_rotations", 6 * NUM_ACTUATED, "-", "parent", "Kabsch-tracked rotations, two columns a joint"
+        "joint_rotations", 6 * NUM_ACTUATED, "-", "parent", "Kabsch-tracked rotations, two columns per joint"
     ),
     ObservationTerm("bone_positions", 3 * NUM_ACTUATED, "m", "root", "joint positions relative to the pelvis"),
     ObservationTerm("bone_velocities", 3 * NUM_JOINTS, "m/s", "root", "velocities of all bones, the pelvis first"),

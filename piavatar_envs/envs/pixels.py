@@ -152,7 +152,7 @@ def _camera_of(
         settings: of the pictures.
         task: the task, whose camera is ``"task"``.
         env: the environments.
-        stage: what is seen, one picture an environment.
+        stage: what is seen, one picture per environment.
         agent: index of the agent.
         out: arrays of views and centers that the camera writes.
     """

@@ -271,7 +271,7 @@ class Task:
 
     @property
     def agent_names(self) -> tuple[str, ...]:
-        """Names of the agents, one an avatar."""
+        """Names of the agents, one per avatar."""
         return tuple(f"agent_{index}" for index in range(len(self.scene.avatars)))
 
     def alone(self) -> Task:

@@ -77,7 +77,7 @@ class Setup:
         kind = load_registered(given.pop("task"), given.pop("registered", None))
         config, steps = given.pop("config", None), given.pop("max_episode_steps", spec.max_episode_steps)
         settings = dict(self.settings)
-        # settings of a training are whole configurations
+        # settings of a training run are whole configurations
         config = settings.pop("config", config)
         loaded = load_keywords(kind.Config, config, given | settings)
         return kind, limited(loaded, "max_episode_steps", steps)

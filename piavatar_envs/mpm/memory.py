@@ -54,7 +54,7 @@ def bound_active_blocks(max_active_blocks: int | None, field: np.ndarray, grid: 
     active_blocks = most if max_active_blocks is None else min(max_active_blocks, most)
     if not 1 <= active_blocks < MAX_ACTIVE_BLOCKS:
         raise ValueError(
-            f"{active_blocks} active blocks an environment: use at least 1 and less than {MAX_ACTIVE_BLOCKS}, by a "
+            f"{active_blocks} active blocks per environment: use at least 1 and less than {MAX_ACTIVE_BLOCKS}, by a "
             f"coarser dx or max_active_blocks"
         )
     return active_blocks

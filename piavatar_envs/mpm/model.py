@@ -205,7 +205,7 @@ class MaterialPoints:
 
 
 def choose_num_substeps(control_dt: float, dx: float, sound_speed: float, cfl: float = 0.5) -> int:
-    """Return the fewest substeps a control step with ``sound_speed * dt <= cfl * dx``."""
+    """Return the fewest substeps per control step with ``sound_speed * dt <= cfl * dx``."""
     return max(1, math.ceil(control_dt * sound_speed / (cfl * dx) - 1.0e-9))
 
 
@@ -267,7 +267,7 @@ def check_points(points: MaterialPoints, num_envs: int, fields: Fields) -> None:
     """Check volumes, densities, fields and the number of rows.
 
     Raises:
-        ValueError: a volume or density is not positive, an array has neither one row nor one an environment, or a
+        ValueError: a volume or density is not positive, an array has neither one row nor one per environment, or a
             particle refers to a velocity field that does not exist.
     """
     if points.field is not None and not (points.field.min() >= 0 and points.field.max() < fields.num_fields):
@@ -275,7 +275,7 @@ def check_points(points: MaterialPoints, num_envs: int, fields: Fields) -> None:
     for name in ("volume", "density", "young_modulus", "poisson_ratio", "material", "retardations"):
         array = getattr(points, name)
         if len(array) not in (1, num_envs):
-            raise ValueError(f"{name} has {len(array)} rows; give it 1 or {num_envs}, one an environment")
+            raise ValueError(f"{name} has {len(array)} rows; give it 1 or {num_envs}, one per environment")
     for name, array in (("volume", points.volume), ("density", points.density)):
         bad = array[~(array > 0.0)]
         if bad.size:
@@ -412,7 +412,7 @@ def choose_path(path: str | None, device: str, field: np.ndarray, max_active_blo
     if path == "block" and not fits:
         raise ValueError(
             f"path='block' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
-            f"particles a body (here {largest_partition(field)}), {MOST_LISTED} in all ({len(field)}), few active "
+            f"particles per body (here {largest_partition(field)}), {MOST_LISTED} in all ({len(field)}), few active "
             f"blocks ({max_active_blocks}) and another decoupling than 'paper' ({decoupling!r}); {target} takes "
             f"{('tiled' if matches else 'plain')!r}"
         )

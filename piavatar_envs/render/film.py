@@ -87,7 +87,7 @@ class Film:
     """Scenes in time.
 
     Attributes:
-        rate: frames a second [1/s].
+        rate: frames per second [1/s].
         num_frames: number of scenes so far.
     """
 

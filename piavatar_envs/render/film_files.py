@@ -1,6 +1,6 @@
 """Files of films: animated glTF, a PLY file for each mesh and frame, and USD (extra ``usd``).
 
-A glTF file stores a mesh's shapes as morph targets, one a frame, and an animation of their weights ("glTF 2.0
+A glTF file stores a mesh's shapes as morph targets, one per frame, and an animation of their weights ("glTF 2.0
 Specification", Khronos Group, 2021, sections 3.7.2.2 and 3.11): this is what importers read without an extension, and
 exact in every frame. Its axes are those of glTF, y up and facing z; the other formats have the suite's, z up.
 """
@@ -54,7 +54,7 @@ def film_writer(folder: Path, kind: str, rate: float) -> FilmWriter:
     Args:
         folder: for ``film.glb``, ``film.usdc`` or ``MESH/0000.ply``; it is made when it is written to.
         kind: one of :data:`FORMATS`.
-        rate: frames a second [1/s].
+        rate: frames per second [1/s].
 
     Raises:
         ImportError: usd-core is not installed, for USD.

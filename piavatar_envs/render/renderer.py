@@ -193,10 +193,12 @@ def _body_albedo(body: Body) -> np.ndarray:
     count = len(body.vertices)
     if body.scalars is not None:
         if np.shape(body.scalars) != (count,):
-            raise ValueError(f"scalars have shape {np.shape(body.scalars)}; give one value a vertex, shape ({count},)")
+            raise ValueError(
+                f"scalars have shape {np.shape(body.scalars)}; give one value per vertex, shape ({count},)"
+            )
         return _linear_strain_table()[strain_color(body.scalars, body.scalar_max)]
     if body.colors is not None and np.shape(body.colors) != (count, 3):
-        raise ValueError(f"colors have shape {np.shape(body.colors)}; give a row a vertex: {count}")
+        raise ValueError(f"colors have shape {np.shape(body.colors)}; give a row per vertex: {count}")
     if body.textures is not None:
         return linear_albedo(body.textures.tints)
     return np.broadcast_to(linear_albedo(body.color if body.colors is None else body.colors), (count, 3))

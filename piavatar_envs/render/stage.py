@@ -2,7 +2,7 @@
 
 What stands there never changes: avatars, soft props, the scene's colliders, the task's markers, then garments. Only
 vertices do.
-They take 12 bytes each a picture, and the particles right beneath a skin as much: some 0.23 MB a picture of the
+They take 12 bytes each per picture, and the particles right beneath a skin as much: some 0.23 MB per picture of the
 embedded body, 0.24 GB of 1,024. All else is shared by the pictures.
 """
 
@@ -151,7 +151,7 @@ class Stage:
         Args:
             simulation: the simulated world.
             markers: what the task shows besides.
-            envs: environments to show, one a picture; all if not given.
+            envs: environments to show, one per picture; all if not given.
         """
         self.simulation, self.device = simulation, simulation.device
         chosen = np.arange(simulation.num_envs) if envs is None else np.asarray(envs)

@@ -42,7 +42,7 @@ class MeshPart:
     def __post_init__(self) -> None:
         shape = (self.num_vertices, 3)
         if self.colors is not None and np.shape(self.colors) != shape:
-            raise ValueError(f"colors have shape {np.shape(self.colors)}; give a row a vertex: {self.num_vertices}")
+            raise ValueError(f"colors have shape {np.shape(self.colors)}; give a row per vertex: {self.num_vertices}")
         if self.textures is not None and (len(self.textures.uv), len(self.textures.image)) != (
             self.num_vertices,
             len(self.faces),
@@ -69,7 +69,7 @@ class Surfaces:
         neighbour_offsets: first entry of each vertex in :attr:`neighbours`, shape ``(V + 1,)``.
         neighbours: vertices that share an edge with every vertex, ascending.
         albedo: linear light in [0, 1] that each vertex reflects, times its texture if it has one, shape ``(1, V)``, or
-            ``(N, V)`` with a row a picture; may be rewritten at any time.
+            ``(N, V)`` with a row per picture; may be rewritten at any time.
         uv: place of each vertex in its texture, shape ``(V,)``.
         texture: texture of each triangle, -1 without one, shape ``(T,)``.
         texels: textures with all their reduced levels, from the full size to one texel, sRGB, shape ``(K, n, 3)``.

@@ -96,7 +96,7 @@ def reference_substeps(
     dx: float,
     wave: float,
 ) -> int:
-    """Return the substeps a control step whose damping of short waves further ones keep, whatever is configured.
+    """Return the substeps per control step whose damping of short waves further ones keep, whatever is configured.
 
     They are those of elastic flesh and moving parts at the usual Courant number (:mod:`piavatar_envs.mpm.retention`).
     ``wave`` is the speed of the fastest elastic wave, of the avatars and what they wear alone [m/s]; the other
@@ -135,7 +135,7 @@ def _fewest(physics: PhysicsConfig, dx: float, wave: float, speed: float) -> int
     chosen = choose_num_substeps(physics.control_dt, dx, max(wave, physics.cfl * speed), physics.cfl)
     if chosen > MOST_SUBSTEPS:
         raise ConfigError(
-            f"waves of {wave:.3g} m/s and parts of up to {speed:.3g} m/s would need {chosen} substeps a control step, "
+            f"waves of {wave:.3g} m/s and parts of up to {speed:.3g} m/s need {chosen} substeps per control step, "
             f"and {MOST_SUBSTEPS} is the limit; use a shorter physics.control_dt, softer, denser or less viscous "
             "matter (young_modulus, density, viscosity, randomize), or slower parts"
         )

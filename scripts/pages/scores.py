@@ -15,7 +15,7 @@ from scripts.pages.entries import ROOT, Entry
 from scripts.pages.markdown import page, table
 
 RESULTS = ROOT / "benchmarks" / "results"
-#: Result of short trainings of all ids, for those without a training of their own.
+#: Result of short training runs of all ids, for those without a training run of their own.
 BRIEF = RESULTS / "scores.json"
 #: Names of programs that write results, as readers know them.
 _PROGRAMS = {"rsl_rl.train": "PPO, rsl_rl", "sb3.train": "stable-baselines3", "skrl.train": "skrl"}
@@ -86,7 +86,7 @@ def _scores() -> tuple[tuple[str, Score], ...]:
 
 
 def _runs() -> Iterator[tuple[str, Score]]:
-    """Yield the rows of all trainings and their later evaluations, each after its environment's name."""
+    """Yield the rows of all training runs and their later evaluations, each after its environment's name."""
     for path in sorted(RESULTS.rglob("results.json")):
         result = json.loads(path.read_text(encoding="utf-8"))
         config = result.get("config") or {}

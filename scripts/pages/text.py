@@ -211,7 +211,7 @@ def _episode(entry: Entry, facts: Facts) -> str:
         [
             "## Episode",
             f'**Success**: `info["success"]` is True when {task.success_doc}.',
-            "**Terminated** when\n\n" + "\n".join(f"- {end};" for end in ends[:-1]) + f"\n- {ends[-1]}.",
+            "**Terminated** when\n\n" + ";\n".join(f"- {end}" for end in ends) + ".",
             f"**Truncated** after `episode_seconds`, {number(config.episode_seconds)} s.",
         ]
     )

@@ -52,7 +52,7 @@ def countdown() -> type[Countdown]:
 
 @pytest.fixture
 def tiny() -> TrainingConfig:
-    """A training of seconds."""
+    """A training run of seconds."""
     return load_training(TINY)
 
 

@@ -1,4 +1,4 @@
-"""Trainings that are killed: by an exception in this process, or by SIGKILL in one of their own.
+"""Training runs that are killed: by an exception in this process, or by SIGKILL in one of their own.
 
 ``python -m tests.agents.killing 5 ARGS`` is ``python -m agents.sb3.train ARGS`` until it has written half of the file
 of its fifth ``fsync``: the configuration and each checkpoint synchronise their file, then its folder, so this is the
@@ -23,11 +23,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 
 class Killed(Exception):
-    """A training has been killed."""
+    """A training run has been killed."""
 
 
 class KillAt(BaseCallback):
-    """Kills a training in this process as soon as it has had some steps."""
+    """Kills a training run in this process as soon as it has had some steps."""
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class KillAt(BaseCallback):
 
 @contextmanager
 def killed_in_step(views: type, count: int) -> Iterator[None]:
-    """Kill a training in this process in the ``count``-th step of its environments, and check that it was."""
+    """Kill a training run in this process in the ``count``-th step of its environments, and check that it was."""
     step, left = views.step, count
 
     def killed(self: Any, actions: Any) -> Any:
@@ -57,7 +57,7 @@ def killed_in_step(views: type, count: int) -> Iterator[None]:
 
 
 def run_killed(count: int, *args: str) -> None:
-    """Run a training that is killed in a write, and check that it was."""
+    """Run a training run that is killed in a write, and check that it was."""
     command = [sys.executable, "-m", "tests.agents.killing", str(count), *args]
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=300)

@@ -1,4 +1,4 @@
-"""A rank of trainings that leaves what it has, fails, or interrupts: started by torchrun in ``test_ranks``.
+"""A rank of training runs that leaves what it has, fails, or interrupts: started by torchrun in ``test_ranks``.
 
 ``torchrun --nproc-per-node=2 -m tests.agents.rank_probe FOLDER LIBRARY FATE ARGS [-- LIBRARY FATE ARGS ...]`` is
 ``-m agents.LIBRARY.train ARGS``, one after the other. FATE is ``whole``; ``fails``: once, rank 1 raises an error in its
@@ -36,7 +36,7 @@ def main(folder: Path, library: str, fate: str, *args: str) -> None:
     asked, learn, checked = StopRequest.asked, train.learn, train.check_finite
 
     def counted(stop: StopRequest) -> bool:
-        nonlocal questions  # one an iteration, and one more after a checkpoint, as rsl_rl's first iteration has
+        nonlocal questions  # one per iteration, and one more after a checkpoint, as rsl_rl's first iteration has
         questions += 1
         if fate == "fails" and ranks.rank == 1 and questions == 3 and not (folder / "failed").exists():
             (folder / "failed").touch()

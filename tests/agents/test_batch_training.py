@@ -1,4 +1,4 @@
-"""Trainings on one batch: evaluations equal those of single environments."""
+"""Training runs on one batch: evaluations equal those of single environments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SETTINGS = {"fidelity": "tiny", "episode_seconds": 0.3}
 
 
 class Training(BatchTraining):
-    """A training as any library has it."""
+    """A training run as any library has it."""
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
 

@@ -1,4 +1,4 @@
-"""Trainings that diverge end with a line, and leave the checkpoint of before."""
+"""Training runs that diverge end with a line, and leave the checkpoint of before."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ TRAININGS = {
 
 
 def ended_with(name: str, folder: Path, device: str, *settings: str) -> str:
-    """Run a training that must fail, and return its message."""
+    """Run a training run that must fail, and return its message."""
     needed, script, config, own, *_ = TRAININGS[name]
     pytest.importorskip(needed, reason="needs its extra")
     main = importlib.import_module(f"agents.{script}").main
@@ -99,7 +99,7 @@ def test_the_checkpoint_of_before_is_kept(name, device, tmp_path, monkeypatch):
     else:
         from skrl.multi_agents.torch.mappo import MAPPO as Algorithm
 
-        # one an agent
+        # one per agent
         spoil_after(monkeypatch, Algorithm, "update", 6, lambda mappo: mappo.values["agent_1"])
     message = ended_with(name, tmp_path / "run", device)
     assert re.search(r"is nan, not finite, after 64 steps; .*; \S+/run/checkpoint.pt is left as it was", message), (

@@ -1,4 +1,4 @@
-"""Ctrl-C in trainings: one line with the step and the remedy, a checkpoint, and a run that plays and resumes."""
+"""Ctrl-C in training runs: one line with the step and the remedy, a checkpoint, and a run that plays and resumes."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_the_second_interrupt_ends_at_once(capfd):
 
 
 def test_workers_leave_the_interrupt_to_their_parent(tmp_path):
-    """In a terminal it reaches all processes of a training: none of them prints a traceback."""
+    """In a terminal it reaches all processes of a training run: none of them prints a traceback."""
     args = ["configs/sb3/reach_ppo.yaml", *QUICK, "total_steps=100000", "num_workers=2", "ppo.rollout_steps=8"]
     command = [sys.executable, "-m", "agents.sb3.train", *args, "ppo.batch_size=8", "--out", str(tmp_path / "run")]
     with (tmp_path / "log").open("wb") as log:

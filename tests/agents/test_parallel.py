@@ -96,7 +96,7 @@ def peek(folded) -> Peek:
     """Two whole episodes of both worlds, as the buffer has them, and their policy."""
     settings = PPOSettings(rollout_steps=2 * LAST, batch_size=10, epochs=1, hidden=(8,), discount=0.9, gae_lambda=0.8)
     model = ppo.build(settings, folded, range(4), seed=7)
-    folded.seed(SEED)  # observations tell it, and a float32 rounds a training's own
+    folded.seed(SEED)  # observations tell it, and a float32 rounds a training run's own
     peek = Peek()
     model.learn(2 * LAST * 6, callback=CallbackList([MarkPlayed(), peek]))
     return peek

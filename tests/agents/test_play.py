@@ -1,4 +1,4 @@
-"""Letting what trainings have left play again."""
+"""Letting what training runs have left play again."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ TRAININGS = {
 
 @pytest.fixture(scope="module")
 def run_of(device, tmp_path_factory):
-    """Folders of short trainings, one a kind."""
+    """Folders of short training runs, one per kind."""
     root = tmp_path_factory.mktemp("runs")
 
     def run(kind: str):

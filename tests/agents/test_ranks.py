@@ -1,4 +1,4 @@
-"""Trainings on several ranks: two processes on CPUs, as torchrun starts them, and what each of them has."""
+"""Training runs on several ranks: two processes on CPUs, as torchrun starts them, and what each of them has."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def torchrun(folder: Path, *args: str, launcher: tuple[str, ...]) -> subprocess.
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Trainings on two machines, here two torchruns of a rank each: one that fails and is restarted, the same without
-    that, and one that is interrupted."""
+    """Runs on two machines, here two torchruns of a rank each: one that fails and is restarted, the same without that,
+    and one that is interrupted."""
     folder = tmp_path_factory.mktemp("ranks")
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -71,7 +71,7 @@ def trained(tmp_path_factory):
 
 
 def facts(folder: Path, fate: str) -> list[dict]:
-    """Return what the ranks of a training have left."""
+    """Return what the ranks of a training run have left."""
     return [json.loads((folder / f"{fate}_{rank}.json").read_text()) for rank in range(2)]
 
 

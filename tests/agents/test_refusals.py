@@ -39,7 +39,7 @@ def refused(main, *line: str) -> str:
 
 @pytest.fixture(scope="module")
 def ended(device, tmp_path_factory) -> Path:
-    """The folder of a training that has ended, of 64 steps in episodes that are longer."""
+    """The folder of a training run that has ended, of 64 steps in episodes that are longer."""
     folder = tmp_path_factory.mktemp("ended")
     (folder / "tiny.yaml").write_text(dump_yaml(load_training(TINY)))
     train.main([str(folder / "tiny.yaml"), "env.episode_seconds=9", "--out", str(folder / "run"), "--device", device])
@@ -102,7 +102,7 @@ def test_scores_are_not_written_over_a_training(ended, tmp_path, device, monkeyp
     kept = {name: tmp_path / name for name in ("checkpoint.pt", "policy.pt", "policy.zip")}
     for name, folder in kept.items():
         folder.mkdir()
-        (folder / name).write_text("of a training")
+        (folder / name).write_text("of a training run")
     for folder in (ended, *kept.values()):
         before, out = contents(folder), ("--out", str(folder), "--device", device)
         lines = (score_pid.main, *STAND, *out), (score_random.main, str(ended), *out), (demo.main, *out)

@@ -1,4 +1,4 @@
-"""Checkpoints: killed trainings resume bit for bit, folders are not overwritten, and damage is detected."""
+"""Checkpoints: killed training runs resume bit for bit, folders are not overwritten, and damage is detected."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def test_no_other_process_trains_where_one_does(tmp_path):
     hold(tmp_path)  # one process may go on where it was
     code = f"from pathlib import Path; from agents.files import hold; hold(Path({str(tmp_path)!r}))"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert "another training writes to" in other.stderr and "--out" in other.stderr
+    assert "another training run writes to" in other.stderr and "--out" in other.stderr
 
 
 @pytest.mark.parametrize("name", ["policy.pt", "policy.zip", "results.json"])
@@ -232,7 +232,7 @@ def test_no_other_process_trains_where_one_does(tmp_path):
 def test_a_run_that_was_kept_is_not_written_over(name, resume, tmp_path):
     (tmp_path / name).write_text("kept")
     config = load_training({"env_id": "PIAvatar/Reach-v0", "env": {"fidelity": "tiny"}})
-    with pytest.raises(ConfigError, match=rf"{name} is of a training that has ended"):
+    with pytest.raises(ConfigError, match=rf"{name} is of a training run that has ended"):
         Checkpoint(tmp_path, "sb3.train", config, "cpu", resume)
     assert (tmp_path / name).read_text() == "kept"
 

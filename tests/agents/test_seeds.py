@@ -1,4 +1,4 @@
-"""Trainings of one seed play the same episodes in all libraries, no others do, and evaluations play none of them."""
+"""Training runs of one seed play the same episodes in all libraries, no others do, evaluations play none of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from piavatar_envs.tasks import load_task
 
 
 class Training(BatchTraining):
-    """A training as any library on a batch has it."""
+    """A training run as any library on a batch has it."""
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
 

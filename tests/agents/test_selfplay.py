@@ -1,4 +1,4 @@
-"""Self-play: the pool, the snapshots drawn from it, and trainings of seconds that beat where they began."""
+"""Self-play: the pool, the snapshots drawn from it, and training runs of seconds that beat where they began."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ AUCTION = {
 
 @pytest.fixture
 def auction(games) -> TrainingConfig:
-    """A training of a second or two."""
+    """A training run of a second or two."""
     return load_training(AUCTION)
 
 

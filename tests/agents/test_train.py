@@ -184,7 +184,7 @@ def test_a_demo_on_a_slow_machine_trains_for_half_of_the_time_and_fails_if_nothi
         pass
 
     def train(*args, deadline):
-        left = deadline(4, 100.0) - time.monotonic()  # at 25 s a step nothing else would fit
+        left = deadline(4, 100.0) - time.monotonic()  # at 25 s per step nothing else would fit
         assert 0.3 * seconds < left <= 0.5 * seconds
         raise Trained
 

@@ -113,7 +113,7 @@ class Rig:
             self.step_graph.run()
 
     def quaternions(self, rotvec) -> np.ndarray:
-        """Return Warp's quaternions of local rotation vectors, one set an environment."""
+        """Return Warp's quaternions of local rotation vectors, one set per environment."""
         rotvec = np.array(np.broadcast_to(rotvec, (self.model.num_envs, NUM_JOINTS, 3)))
         return Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_quat().reshape(-1, NUM_JOINTS, 4).astype(np.float32)
 
@@ -258,7 +258,7 @@ def build_rig(
 ) -> Rig:
     """Build a standing avatar ``cells`` grid spacings tall.
 
-    ``shapes`` are shape parameters by name, one set an environment; ``half_width`` is that of the domain [m];
+    ``shapes`` are shape parameters by name, one set per environment; ``half_width`` is that of the domain [m];
     ``others`` is the number of particles before the avatar's, in a row in the domain's corner. ``colliders`` follow
     the ``floor``. ``keeps_volume`` corrects the rest pose. ``alpha_of`` returns the shape preservation of
     particles by their rest positions.

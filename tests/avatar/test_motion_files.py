@@ -177,7 +177,7 @@ def test_malformed_files_are_refused(tmp_path: Path, changes: dict, message: str
     [
         ({"trans": np.outer(np.arange(4), [12.0, 0.0, 0.0])}, r"root moves at .* m/s .*millimetres"),  # 1.4 m/s
         ({"turned": {"left_knee": (90.0, 0.0, 0.0)}}, r"joint turns by 90 rad .*degrees"),
-        ({"mocap_framerate": np.array(1.0 / 120.0)}, r"0\.00833.* frames a second .*of 120 frames"),
+        ({"mocap_framerate": np.array(1.0 / 120.0)}, r"0\.00833.* frames per second .*of 120 frames"),
     ],
 )
 def test_units_of_another_kind_are_refused_with_the_likely_cause(tmp_path: Path, changes: dict, message: str) -> None:

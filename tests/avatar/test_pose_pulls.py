@@ -76,7 +76,7 @@ def test_shape_preservation_heals_the_shape_and_nothing_else_does(make_rig):
 
 
 def test_kinematic_shape_preservation_undoes_alpha_of_the_error_a_step(make_rig):
-    # x -= alpha (x - LBS) / num_substeps, num_substeps times a control step, toward bones that do not move
+    # x -= alpha (x - LBS) / num_substeps, num_substeps times per control step, toward bones that do not move
     rig = make_rig(root="free", decoupling="no_stress", num_substeps=12, alpha=0.3, shape_preservation="kinematic")
     bulge(rig)
     before = rig.shape_error().max()

@@ -181,7 +181,7 @@ def test_a_commanded_walk_is_followed_without_lag(make_rig):
         world, position = rig.tracked_world()
         np.testing.assert_allclose(position[0], root, atol=5e-4)
         assert (Rotation.from_rotvec(rotvec[0]).inv() * Rotation.from_matrix(world[0])).magnitude() < 1e-4
-        # 0.005 m a step faster in every step of 1/30 s, then as fast as before
+        # 0.005 m per step faster in every step of 1/30 s, then as fast as before
         pushed = -rig.mass.sum() * 0.005 * 30.0**2 if walked - before < 1.0 or k == 8 else 0.0
         expected = (0.0, pushed, weight)
         np.testing.assert_allclose(rig.avatar.state.wrench_force.numpy()[0], expected, atol=0.05 * weight)

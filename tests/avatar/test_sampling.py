@@ -173,7 +173,7 @@ def test_links_do_not_cross_air_gaps(surface, coarse):
 
 
 def test_bone_particles(coarse):
-    # At least 18 a joint, rigid, and spread in all three directions.
+    # At least 18 per joint, rigid, and spread in all three directions.
     for joint, name in enumerate(JOINT_NAMES):
         own = coarse.bone == joint
         assert own.sum() >= 18, name

@@ -1,4 +1,4 @@
-"""The benchmark of ranks: what it makes of a training's figures."""
+"""The benchmark of ranks: what it makes of a training run's figures."""
 
 from __future__ import annotations
 

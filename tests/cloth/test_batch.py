@@ -14,7 +14,7 @@ from piavatar_envs.mpm.colliders import Collider, make_boundaries
 from piavatar_envs.mpm.types import FAILURE_CLOTH
 from tests.gpu_on_cpu import gpu_on_cpu
 
-#: Places of the balls that sheets fall on, one an environment [m].
+#: Places of the balls that sheets fall on, one per environment [m].
 STARTS = (0.0, 0.03, 0.06)
 
 

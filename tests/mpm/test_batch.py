@@ -14,7 +14,7 @@ COUNT = 512
 
 
 def start(sim, seeds):
-    """Set smooth random velocities, physical and prescribed, from one seed an environment."""
+    """Set smooth random velocities, physical and prescribed, from one seed per environment."""
     draws = [np.random.default_rng(seed).normal(size=(4, 3)) for seed in seeds]
     u = np.stack([d[0] + np.sin(20.0 * sim.rest) * d[1] for d in draws])
     vk = np.stack([0.3 * np.cos(15.0 * sim.rest) * d[2] for d in draws])

@@ -136,7 +136,7 @@ def test_a_thin_plate_bears_what_a_thick_one_does(simulate):
 
 @pytest.mark.parametrize("kind", ["sphere", "box", "capsule"])
 def test_no_way_crosses_a_solid(simulate, kind):
-    # a particle an environment, at up to a cell a substep, from all around, at all angles, at the edges too
+    # a particle per environment, at up to a cell a substep, from all around, at all angles, at the edges too
     size = {"sphere": (0.02,), "box": (0.1, 0.001, 0.1), "capsule": (0.01, 0.1)}[kind]
     solid, rng, count = place(kind, size, friction=0.3), np.random.default_rng(0), 300
     way = rng.normal(size=(count, 1, 3))

@@ -97,5 +97,5 @@ def test_pictures_of_a_batch_have_the_same_holes(device):
 
 
 def test_an_opacity_of_another_size_is_refused():
-    with pytest.raises(ValueError, match="one value a pixel"):
+    with pytest.raises(ValueError, match="one value per pixel"):
         Texture(np.zeros((4, 4, 3), np.uint8), alpha=np.zeros((4, 5), np.uint8))

@@ -288,7 +288,7 @@ def test_colours_of_vertices_and_rows_of_albedo(device):
     first, second = painter.color.numpy()[:, 8, 8]
     np.testing.assert_allclose(first[[1, 0, 2]], second, atol=0.05)
     assert second.argmax() == 1
-    with pytest.raises(ValueError, match="a row a vertex"):
+    with pytest.raises(ValueError, match="a row per vertex"):
         MeshPart(5, faces, colors=green)
     with pytest.raises(ValueError, match="corners from 0 to 3"):
         Surfaces.build([MeshPart(3, faces)], device)

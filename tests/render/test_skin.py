@@ -139,7 +139,7 @@ def test_noise_of_particles_does_not_crumple_the_skin(subject):
 
 def test_bad_particles_are_refused(subject):
     particles = subject.particles
-    with pytest.raises(ValueError, match="one row a particle"):
+    with pytest.raises(ValueError, match="one row per particle"):
         Skin(subject.asset, subject.body, subject.positions[1:], particles.skin_joints, particles.skin_weights)
     with pytest.raises(ValueError, match="at least one"):
         Skin(subject.asset, subject.body, np.zeros((0, 3)), particles.skin_joints[:0], particles.skin_weights[:0])

@@ -1,4 +1,4 @@
-"""A training of RLlib on two nodes of a local cluster, one of which is killed in the middle."""
+"""A training run of RLlib on two nodes of a local cluster, one of which is killed in the middle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trainings by agents.rllib: the published configurations, policies without RLlib, going on, and refusals."""
+"""Training runs by agents.rllib: the published configurations, policies without RLlib, going on, and refusals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("local_ray")
 
 
 def progress(folder: Path) -> np.ndarray:
-    """Return the numbers of progress.csv, a row an iteration."""
+    """Return the numbers of progress.csv, a row per iteration."""
     return np.loadtxt(folder / "progress.csv", delimiter=",", skiprows=1, ndmin=2)
 
 
@@ -58,7 +58,7 @@ def test_published_configurations_train_go_on_and_leave_their_results(path, tmp_
 
 
 def test_a_trained_policy_plays_as_in_training(tmp_path):
-    """Play what is left of a finished training, and of the same one as if it had been interrupted."""
+    """Play what is left of a finished training run, and of the same one as if it had been interrupted."""
     reach, game = (next(path for path in CONFIGS if path.stem == name) for name in ("reach_rllib", "high_five_rllib"))
     train.main([str(reach), *TINY, "iterations=1", "--out", str(tmp_path)])
     then, out = json.loads((tmp_path / "results.json").read_text()), tmp_path / "evaluation.json"

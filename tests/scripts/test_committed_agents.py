@@ -37,7 +37,7 @@ def test_train_all_stops_in_time_goes_on_and_leaves_finished_trainings(tmp_path,
         return capsys.readouterr().err.count("the same command goes on")
 
     assert train(minutes=0.0) == 1 and not folder.exists()
-    with monkeypatch.context() as patch:  # a training that does not end by itself, stopped once it has begun
+    with monkeypatch.context() as patch:  # a training run that does not end by itself, stopped once it has begun
         endless = [sys.executable, "-c", f"open({str(folder / 'begun')!r}, 'w'), __import__('time').sleep(600)"]
         patch.setattr(train_all.Job, "command", lambda *_: endless)
         patch.setattr(train_all.time, "monotonic", lambda: float((folder / "begun").exists()))
@@ -81,7 +81,7 @@ def test_train_all_knows_every_configuration():
 
 
 def make_run(folder: Path, value: float) -> Path:
-    """Write a finished training whose policy returns ``value``."""
+    """Write a finished training run whose policy returns ``value``."""
     folder.mkdir(parents=True)
     rows = [{"case": "zero", "return_mean": 1000.0}, {"case": "trained", "return_mean": value}]
     (folder / "config.yaml").write_text(yaml.safe_dump(CONFIG))
@@ -134,7 +134,7 @@ def test_rescore_has_a_job_for_every_committed_agent():
     policies = {path.parent for path in RESULTS.glob("ppo/*/policy.*")}
     committed = {*policies, *RESULTS.glob("pid/*"), *RESULTS.glob("random/*")}
     assert {job.source for job in jobs} == committed and len(jobs) == len(committed)
-    assert len(policies) == len({path.name.rpartition("_")[0] for path in RESULTS.glob("ppo/*")})  # one a training
+    assert len(policies) == len({path.name.rpartition("_")[0] for path in RESULTS.glob("ppo/*")})  # one a training run
     assert all("cuda" in job.command for job in jobs)
 
 

@@ -86,6 +86,11 @@ def test_tables_list_the_returned_values_and_all_settings(page):
         assert cell.endswith(", logarithmic") == drawn[name].log
 
 
+def test_blocks_of_a_page_are_one_blank_line_apart(page):
+    """Two of them, as a list without its first item leaves, would end a list for readers of Markdown."""
+    assert "\n\n\n" not in page[2]
+
+
 def test_usage_runs(page, device):
     block = re.search(r"```python\n(.*?)```", page[2], re.DOTALL)[1]
     tiny = block.replace(', render_mode="rgb_array")', f', fidelity="tiny", device="{device}")')

@@ -21,7 +21,7 @@ def factors_of(batch) -> dict[str, np.ndarray]:
 
 
 def constants_of(batch, avatar: int = 0) -> dict[str, np.ndarray]:
-    """Return the constants that follow from the factors, a row an environment."""
+    """Return the constants that follow from the factors, a row per environment."""
     sim, n = batch.simulation, batch.num_envs
     model, own_avatar = sim.model, sim.avatars[avatar]
     own = slice(own_avatar.body.first, own_avatar.body.first + own_avatar.body.count)

@@ -21,7 +21,7 @@ FREE = {
     "pd": {"control": "pd"},
     "torque": {"control": "torque"},
 }
-#: A substep a control step, in which the arm of a force is known exactly.
+#: A substep per control step, in which the arm of a force is known exactly.
 FINE = 1.0 / 600.0
 
 

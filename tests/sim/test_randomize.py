@@ -195,7 +195,7 @@ def test_the_root_carries_the_drawn_weight(make_batch):
 
 
 def test_things_slide_by_the_drawn_friction(make_batch):
-    # A box on the floor loses ``factor mu g`` of its speed a second.
+    # A box on the floor loses ``factor mu g`` of its speed per second.
     box = {"name": "box", "shape": "box", "size": (0.3, 0.3, 0.3), "friction": 0.4, "mass": 100.0}
     box |= {"position": (0.0, -1.2, 0.3), "velocity": (1.5, 0.0, 0.0)}
     batch = make_batch(REACH, 3, **VARIED, **{"scene.props": [box]})

@@ -43,7 +43,7 @@ def widths(env) -> np.ndarray:
 
 
 def test_flesh_does_not_wear_out_in_limbs_that_swing(make_batch):
-    # Inertia strains it by 4e-4; integration errors once added 2.6e-3 a second, and stayed when limbs came to rest.
+    # Inertia strains it by 4e-4; integration errors once added 2.6e-3 per second, and stayed when limbs came to rest.
     settings = {"fidelity": "coarse", "root_assist": 1.0, "control": "pd", "pose_noise": 0.0, **EMPTY}
     batch = make_batch("PIAvatar/Stand-v0", 1, **settings)
     batch.reset(seeds=[0])

@@ -178,7 +178,7 @@ def test_memory_is_counted(make_batch):
 
 
 def arrays_of(*owners) -> list:
-    """Return the arrays of a row an environment that objects and their structs hold."""
+    """Return the arrays of a row per environment that objects and their structs hold."""
     found = {}
     for owner in owners:
         for value in vars(owner).values():

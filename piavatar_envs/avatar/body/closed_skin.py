@@ -239,7 +239,7 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the first of each set of equal rows of integers ``(N, 3)``, and for every row the number of its set."""
     low = rows.min(axis=0)
     size = [int(width) + 1 for width in rows.max(axis=0) - low]
-    if math.prod(size) < 2**62:  # one number a row sorts many times faster
+    if math.prod(size) < 2**62:  # one number per row sorts many times faster
         rows = ((rows - low) * [size[1] * size[2], size[2], 1]).sum(axis=1)
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first, inverse.ravel()

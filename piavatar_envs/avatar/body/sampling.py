@@ -403,7 +403,7 @@ def sample_particles(
     if not 0.0 < spacing <= coarsest:
         raise ValueError(f"spacing={spacing} m is outside (0, {coarsest:.3g}]; coarser would lose hands and feet")
     if bone_rings < 4:
-        raise ValueError(f"bone_rings={bone_rings} gives under {MIN_BONE_PARTICLES} particles a bone; use 4 or more")
+        raise ValueError(f"bone_rings={bone_rings} gives under {MIN_BONE_PARTICLES} particles per bone; use 4 or more")
     surface = (asset.vertices, asset.faces, asset.joints, asset.skin_joints, asset.skin_weights)
     values = [*surface, asset.skeleton, asset.surface_points, spacing, seed, bone_rings, bone_voxel]
     digest = digest_of(values, [sys.modules[__name__], skeleton_mesh])

@@ -40,7 +40,7 @@ class Texture:
             ValueError: it does not.
         """
         if self.alpha is not None and self.alpha.shape != self.pixels.shape[:2]:
-            raise ValueError(f"alpha has shape {self.alpha.shape}; give one value a pixel: {self.pixels.shape[:2]}")
+            raise ValueError(f"alpha has shape {self.alpha.shape}; give one value per pixel: {self.pixels.shape[:2]}")
 
     def at(self, uv: np.ndarray) -> np.ndarray:
         """Return linear colours between the pixels, shape ``(N, 3)``.
@@ -84,7 +84,7 @@ class Textures:
         count = len(self.uv)
         if np.shape(self.uv) != (count, 2) or np.shape(self.tints) != (count, 3):
             shapes = f"{np.shape(self.uv)} and {np.shape(self.tints)}"
-            raise ValueError(f"uv and tints have shapes {shapes}; give (V, 2) and (V, 3), a row a vertex")
+            raise ValueError(f"uv and tints have shapes {shapes}; give (V, 2) and (V, 3), a row per vertex")
         if len(self.image) and not -1 <= self.image.min() <= self.image.max() < len(self.images):
             raise ValueError(f"a triangle has texture {self.image.max()} of {len(self.images)}; use -1 for none")
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.motion.recording import Recording, whole_rate
 from piavatar_envs.core.reading import reading
 
-MAX_BYTES = 2**28  # of a file: an hour of capture at 120 frames a second has half of it
+MAX_BYTES = 2**28  # of a file: an hour of capture at 120 frames per second has half of it
 MAX_JOINTS = 2000
 LEAST_SHARE = 0.5  # of the frames that a header announces; a file with fewer was cut off
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)

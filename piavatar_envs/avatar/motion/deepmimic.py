@@ -122,7 +122,7 @@ def mend_jumps(rotations: np.ndarray, fps: float) -> np.ndarray:
 
     Args:
         rotations: wxyz, shape ``(num_frames, 22, 4)``.
-        fps: frames a second [1/s].
+        fps: frames per second [1/s].
 
     Returns:
         Rotations of the same shape.

@@ -63,7 +63,7 @@ def ground_level(heights: np.ndarray, fps: float, window: float, loop: bool) -> 
 
     Args:
         heights: lowest skin point of each frame [m], shape ``(num_frames,)``.
-        fps: frames a second [1/s].
+        fps: frames per second [1/s].
         window: width of the window [s].
         loop: the last frame is the first of the next round.
 

@@ -175,8 +175,8 @@ def _checked(path: str, motion: Motion) -> Motion:
         ValueError: its rate or the speed of its root is out of range; names the likely cause.
     """
     if not RATES[0] <= motion.fps <= RATES[1]:
-        cause = f"it may be the time between frames [s], of {1.0 / motion.fps:g} frames a second"
-        raise ValueError(f"{path}: {motion.fps:g} frames a second must be in [{RATES[0]:g}, {RATES[1]:g}]; {cause}")
+        cause = f"it may be the time between frames [s], of {1.0 / motion.fps:g} frames per second"
+        raise ValueError(f"{path}: {motion.fps:g} frames per second must be in [{RATES[0]:g}, {RATES[1]:g}]; {cause}")
     steps = motion.fps * np.linalg.norm(np.diff(motion.root_position, axis=0), axis=1)
     if steps.max() > ROOT_SPEED:
         cause = "its lengths may be in millimetres or centimetres and not in metres, or its frame rate too high"

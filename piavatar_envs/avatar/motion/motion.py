@@ -40,7 +40,7 @@ class Motion:
 
     Attributes:
         name: its name for :func:`~piavatar_envs.avatar.motion.load_motion`.
-        fps: frames a second [1/s].
+        fps: frames per second [1/s].
         local_rotations: rotation of each joint relative to its parent (the root: to the world), wxyz, identity in the
             rest pose of the embedded body, shape ``(num_frames, 22, 4)``; successive frames lie in one hemisphere.
         root_position: the pelvis joint [m], shape ``(num_frames, 3)``, z up.

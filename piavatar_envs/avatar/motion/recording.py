@@ -52,7 +52,7 @@ class Recording:
 
     Attributes:
         name: of the clip.
-        fps: frames a second [1/s].
+        fps: frames per second [1/s].
         names: of the nodes.
         parents: node that each hangs on, -1 for a root, shape ``(N,)``.
         zero: positions in the zero pose, shape ``(N, 3)``.

@@ -173,7 +173,7 @@ class ArticulatedBody:
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
         if firm is not None and firm.shape != (points.num_points,):
-            raise ValueError(f"firm has shape {firm.shape}, expected ({points.num_points},): one a particle")
+            raise ValueError(f"firm has shape {firm.shape}, expected ({points.num_points},): one per particle")
         self.body, self._partitions = partition_body(points, body, device)
         self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))

@@ -122,7 +122,7 @@ def check_settings(source: str, settings: Mapping[str, Any]) -> None:
 
 
 def load_asset(source: str = "embedded", path: str | Path | None = None, **settings: Any) -> AvatarAsset:
-    """Return the body of a source, built once a process for equal settings and unchanged files.
+    """Return the body of a source, built once per process for equal settings and unchanged files.
 
     Args:
         source: name of the source.
