@@ -13,6 +13,7 @@ from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights
 from piavatar_envs.avatar.body.sampling import ClosedSurface, sample_particles
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.body.sources import check_settings, gaussian, load_asset, source_of
+from piavatar_envs.avatar.body.sources.mesh import UPS
 from piavatar_envs.avatar.body.splat_files import write_ply
 from piavatar_envs.avatar.body.splat_registration import FittedBody
 from piavatar_envs.config import ConfigError, load_config
@@ -141,6 +142,20 @@ def test_axes_units_and_poses_reach_the_fit(person, fitted, tmp_path):
     np.testing.assert_allclose(pose[joint_index("left_shoulder")] @ [0, 0, 1], [np.sin(0.5), 0, np.cos(0.5)])
 
 
+def test_axes_that_seldom_point_up_are_tried_when_no_other_fits(person, fitted, tmp_path, monkeypatch):
+    cloud = on_body(person, COUNT)
+    write_ply(tmp_path / "a.ply", cloud.placed(UPS["-x"].T, 1.0, np.zeros(3)))
+    near, top, tried = gaussian._fitted(), cloud.means[:, 2].argmax(), []
+
+    def fit(asset, placed, *others):
+        tried.append(bool(placed.means[top, 2] > 0.99 * placed.means[:, 2].max()))
+        return near if tried[-1] else dataclasses.replace(near, residual=0.04)
+
+    monkeypatch.setattr(gaussian, "_fitted", fit)
+    gaussian.build(str(tmp_path / "a.ply"))
+    assert sum(tried) == 1 and not tried[0]
+
+
 def test_weights_of_a_file_are_those_of_our_joints(person, fitted, tmp_path):
     cloud = on_body(person, COUNT)
     write_ply(tmp_path / "a.ply", cloud)
@@ -198,7 +213,7 @@ def test_what_does_not_fit_is_refused(person, tmp_path, monkeypatch):
     for name, given, message in (
         ("few.ply", {}, "50 splats are more opaque than 0.5"),
         ("big.ply", {}, "give its height in metres"),
-        ("a.ply", {"up": "x"}, "up='x' is no axis.*z, y, -z, -y"),
+        ("a.ply", {"up": "w"}, "up='w' is no axis.*z, y, x, -z, -y, -x"),
         ("a.ply", {"pose": "B"}, "pose='B' is none of A, T and no .json"),
         ("a.ply", {"height": 9.0}, r"height=9 is outside \[0.3, 3\]"),
         ("a.ply", {"body": {"source": "no"}}, "unknown avatar source 'no'"),

@@ -86,8 +86,30 @@ def test_a_height_wins_over_the_unit_of_the_file():
 def test_a_surface_that_the_body_does_not_fit_to_is_refused(file, monkeypatch):
     bad = Registered(np.zeros(3), np.zeros(11), np.zeros((22, 3)), np.zeros((1, 22)), residual=0.04)
     monkeypatch.setattr(mesh, "_registered", lambda *_: bad)
-    with pytest.raises(ValueError, match=r"person.ply: the body does not fit.* 6\.\d cm away.*A- or T-pose"):
+    with pytest.raises(ValueError, match=r"person.ply: the body does not fit.* 6\.\d cm away.*A- or T-pose.*, -x\)"):
         mesh.read_character(str(file))
+    with pytest.raises(ValueError, match=r"up='w' is no axis.*z, y, x, -z, -y, -x"):
+        mesh.read_character(str(file), up="w")
+
+
+@pytest.mark.parametrize("up", mesh.UPS)
+@pytest.mark.parametrize("ahead", range(2))
+def test_any_axis_may_point_up(person, tmp_path, monkeypatch, up, ahead):
+    def registered(name, vertices, faces):  # in place of the fit, which takes seconds
+        rises = vertices[person.vertices[:, 2].argmax(), 2] - vertices[person.vertices[:, 2].argmin(), 2]
+        residual = 0.004 if rises > 0.99 * np.ptp(vertices[:, 2]) else 0.04
+        return Registered(np.zeros(3), np.zeros(11), person.joints, person.weights, residual)
+
+    monkeypatch.setattr(mesh, "_registered", registered)
+    turned = (
+        person.vertices @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) if ahead else person.vertices
+    )
+    trimesh.Trimesh(100.0 * turned @ mesh.UPS[up], person.faces, process=False).export(tmp_path / "a.ply")
+    for given in ({}, {"up": up}):
+        read = mesh.read_character(str(tmp_path / "a.ply"), **given)
+        assert f"{up} points up" in read.notes
+        np.testing.assert_allclose(read.vertices[:, 2], turned[:, 2], atol=1e-5)
+        assert np.linalg.det(read.placement[0]) == pytest.approx(1e-6)  # turned, not mirrored
 
 
 @pytest.mark.parametrize(

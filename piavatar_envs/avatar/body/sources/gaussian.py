@@ -18,7 +18,7 @@ from piavatar_envs.avatar.body.registration import POSES
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.smpl_file import FIRST_HAND_JOINT, MODELS
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.body.sources.mesh import Y_UP, in_metres
+from piavatar_envs.avatar.body.sources.mesh import UPS, check_up, in_metres, nearest_fit
 from piavatar_envs.avatar.body.splat_files import read_splats
 from piavatar_envs.avatar.body.splat_registration import (
     OPAQUE,
@@ -34,13 +34,6 @@ from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Endings of files that only this source reads.
 SUFFIXES = (".spz",)
-#: Our axes from those of a file by the axis that points up.
-UPS = {
-    "z": np.eye(3),
-    "y": Y_UP,
-    "-z": np.diag([1.0, -1.0, -1.0]),
-    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-}
 #: Greatest mean distance between the splats and the fitted body, over the height; clothes are loose.
 MOST_RESIDUAL = 0.02
 #: Greatest distance of a splat from the body, and greatest standard deviation, over the body's height.
@@ -66,7 +59,7 @@ def build(
             pose in which bodies of this package rest; A or T by default.
         weights: an ``.npz`` with the skinning ``weights`` of the splats, shape ``(S, J)``, for our 22 joints or those
             of SMPL, SMPL-H or SMPL-X; by default those of the nearest point of the body's skin.
-        up: axis that points up, ``"z"``, ``"y"``, ``"-z"`` or ``"-y"``; found by proportions if not given.
+        up: axis that points up, of :data:`.mesh.UPS`; found by proportions if not given.
         height: of the person [m]; by default the file's own, in metres, centimetres or millimetres.
         body: settings of another source, whose body is fitted, such as ``{"source": "smplx", "path": ...}``; its shape
             parameters are fitted, too.
@@ -76,24 +69,25 @@ def build(
         FileNotFoundError: there is no such file.
         ValueError: a file cannot be read, has no person's height, or the body does not fit to it.
     """
-    if up is not None and up not in UPS:
-        raise ValueError(f"up={up!r} is no axis that points up; use one of {', '.join(UPS)}")
+    check_up(up)
     asset = load_asset(**(body or {}))
     cloud = read_splats(path)
     _check_extent(cloud, Path(path).name)
     rotations = None if pose in (None, *POSES) else _read_pose(Path(pose))
     starts = (pose,) if pose in POSES else (POSES if pose is None else ("A",))
-    fits = []
-    for axis in (up,) if up else _possible_ups(cloud, Path(path)):
+
+    def fit(axis: str) -> tuple[FittedBody, SplatCloud]:
         placed = _in_metres(Path(path).name, cloud.placed(UPS[axis], 1.0, np.zeros(3)), height)
-        fits.append((_fitted(asset, placed, starts, rotations, Path(path).name), placed))
-    fitted, placed = min(fits, key=lambda one: one[0].residual)
+        return _fitted(asset, placed, starts, rotations, Path(path).name), placed
+
+    size = np.ptp(opaque_box(cloud), axis=0)
+    fitted, placed = fit(up) if up else nearest_fit(fit, _usual_ups(size, Path(path)), size, MOST_RESIDUAL)
     tall = float(np.ptp(fitted.posed[:, 2]))
     if fitted.residual > MOST_RESIDUAL:
         raise ValueError(
             f"{path}: the body does not fit to the splats, which are {100.0 * fitted.residual * tall:.1f} cm away from "
             f"it on average, more than {100.0 * MOST_RESIDUAL * tall:.1f}; use one standing person, name the pose and "
-            "the axis that points up, and remove the background"
+            f"the axis that points up ({', '.join(UPS)}), and remove the background"
         )
     dense = (
         nearest_weights(asset, fitted, placed.means) if weights is None else _read_weights(Path(weights), len(cloud))
@@ -150,12 +144,11 @@ def _check_extent(cloud: SplatCloud, name: str) -> None:
             )
 
 
-def _possible_ups(cloud: SplatCloud, path: Path) -> tuple[str, ...]:
-    """Return the axes that may point up: a person is least deep from front to back, and x never points up."""
+def _usual_ups(size: np.ndarray, path: Path) -> tuple[str, ...]:
+    """Return the axes that point up in most files, of those that a person's proportions allow."""
     if path.suffix.lower() in (".glb", ".gltf"):
         return ("y",)  # as its specification says
-    low, high = opaque_box(cloud)
-    return {0: tuple(UPS), 1: ("z", "-z"), 2: ("y", "-y")}[int((high - low).argmin())]
+    return {0: ("z", "y", "-z", "-y"), 1: ("z", "-z"), 2: ("y", "-y")}[int(size.argmin())]
 
 
 def _in_metres(name: str, cloud: SplatCloud, height: float | None) -> SplatCloud:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,10 +35,20 @@ MOST_RESIDUAL = 0.015
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 #: Our axes from those of a file in which y points up.
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+#: Our axes from those of a file by the axis that points up.
+UPS = {
+    "z": np.eye(3),
+    "y": Y_UP,
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-x": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]]),
+}
 #: Colour of surfaces without one.
 _CLAY = (219, 194, 176)
 #: Size of a file that an OBJ file names.
 _MOST_BYTES = 2**26
+_Fit = TypeVar("_Fit", bound=tuple[Any, ...])
 
 
 def build(path: str, height: float | None = None, up: str | None = None, skeleton: str | None = None) -> AvatarAsset:
@@ -46,7 +57,7 @@ def build(path: str, height: float | None = None, up: str | None = None, skeleto
     Args:
         path: of the file.
         height: of the body [m]; by default the file's own, in metres, centimetres or millimetres.
-        up: axis that points up, ``"y"`` or ``"z"``; found by the proportions of a person if not given.
+        up: axis that points up, of :data:`UPS`; found by the proportions of a person if not given.
         skeleton: mesh of a skeleton, or a folder of its parts, in the file's coordinates.
 
     Raises:
@@ -62,22 +73,24 @@ def read_character(path: str, height: float | None = None, up: str | None = None
     """Return the surface with joints and weights of the registered body; arguments and errors as for :func:`build`."""
     name = Path(path).name
     vertices, faces, colors, textures = load_surface(Path(path))
-    if up not in (None, "y", "z"):
-        raise ValueError(f"up={up!r} is no axis that points up; use y or z")
-    found = []
-    for axis in [up] if up else _possible_ups(vertices, Path(path).suffix.lower()):
-        matrix = Y_UP if axis == "y" else np.eye(3)
-        upright = vertices @ matrix.T
+    check_up(up)
+
+    def fit(axis: str) -> tuple[Registered, np.ndarray, np.ndarray, tuple[str, ...]]:
+        upright = vertices @ UPS[axis].T
         scaled, note = in_metres(name, upright, height)
-        matrix = matrix * (np.ptp(scaled[:, 2]) / np.ptp(upright[:, 2]))
-        found.append((_registered(name, scaled, faces), scaled, matrix, (f"{axis} points up", *note)))
-    registered, scaled, matrix, notes = min(found, key=lambda one: one[0].residual)
+        matrix = UPS[axis] * (np.ptp(scaled[:, 2]) / np.ptp(upright[:, 2]))
+        return _registered(name, scaled, faces), scaled, matrix, (f"{axis} points up", *note)
+
+    size = np.ptp(vertices, axis=0)
+    usual = _usual_ups(size, Path(path).suffix.lower())
+    registered, scaled, matrix, notes = fit(up) if up else nearest_fit(fit, usual, size, MOST_RESIDUAL)
     tall = float(np.ptp(scaled[:, 2]))
     if registered.residual > MOST_RESIDUAL:
         raise ValueError(
             f"{name}: the body does not fit to the surface, which is {100.0 * registered.residual * tall:.1f} cm away "
             f"from it on average, more than {100.0 * MOST_RESIDUAL * tall:.1f}; use a standing person in an A- or "
-            "T-pose, name the axis that points up, or give the file a skeleton and use the source glb"
+            f"T-pose, name the axis that points up ({', '.join(UPS)}), or give the file a skeleton and use the source "
+            "glb"
         )
     turn = _facing(registered)
     return Character(
@@ -198,11 +211,43 @@ class _Beside:
     __getitem__ = get
 
 
-def _possible_ups(vertices: np.ndarray, suffix: str) -> list[str]:
-    """Return the axes that may point up: a person is least deep from front to back, and x never points up."""
+def check_up(up: str | None) -> None:
+    """Refuse what is no axis that points up.
+
+    Raises:
+        ValueError: it is not one of :data:`UPS`.
+    """
+    if up is not None and up not in UPS:
+        raise ValueError(f"up={up!r} is no axis that points up; use one of {', '.join(UPS)}")
+
+
+def nearest_fit(fit: Callable[[str], _Fit], usual: Sequence[str], size: np.ndarray, most: float) -> _Fit:
+    """Return the fit of the axis for which the body is nearest to the file.
+
+    Where no usual axis is the right one, the others are tried, but for that from front to back, along which a person is
+    least deep.
+
+    Args:
+        fit: gives the fit for an axis of :data:`UPS`, of which the first item has a ``residual``.
+        usual: axes that point up in most files.
+        size: of the file along x, y and z, shape ``(3,)``.
+        most: residual of a body that fits.
+    """
+    fits = [fit(axis) for axis in usual]
+    if min(one[0].residual for one in fits) > most:
+        deep = "xyz"[int(np.argmin(size))]
+        for axis in UPS:
+            if axis not in usual and axis[-1] != deep:
+                with suppress(ValueError):  # along that axis it has no height of a person
+                    fits.append(fit(axis))
+    return min(fits, key=lambda one: one[0].residual)
+
+
+def _usual_ups(size: np.ndarray, suffix: str) -> list[str]:
+    """Return the axes that point up in most files, of those that a person's proportions allow."""
     if suffix in _GLTF:
         return ["y"]  # as its specification says
-    return {0: ["z", "y"], 1: ["z"], 2: ["y"]}[int(np.ptp(vertices, axis=0).argmin())]
+    return {0: ["z", "y"], 1: ["z"], 2: ["y"]}[int(size.argmin())]
 
 
 def in_metres(name: str, vertices: np.ndarray, height: float | None) -> tuple[np.ndarray, tuple[str, ...]]:
