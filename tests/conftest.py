@@ -105,6 +105,19 @@ def restored_registries() -> Iterator[None]:
             registered.update(before.get(name, {}))
 
 
+@pytest.fixture
+def empty_kernel_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make an empty folder the cache of Warp, and of results kept beside its kernels; return the folder."""
+    import warp as wp
+
+    from piavatar_envs.core.kernel_cache import init_warp
+
+    init_warp()  # or the folder restored after this test would be None, as it is before Warp is initialised
+    folder = tmp_path / "kernel_cache"
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(folder))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def make_env(device: str):
     """A maker of single environments without wrappers, ``make_env(env_id, **settings)``, tiny by default.

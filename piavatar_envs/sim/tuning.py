@@ -2,7 +2,8 @@
 
 Moduli and friction lie in arrays that every step reads, and are written in place. Gravity, tone and alpha are arguments
 of recorded launches: their steps are recorded anew. The time step stays, so that whatever would need a shorter one is
-refused with the reason, and needs a world of its own.
+refused with the reason, and needs a world of its own. What a substep damps stays with it, also in softer flesh, whose
+own world would retain more (:mod:`piavatar_envs.mpm.retention`).
 """
 
 from __future__ import annotations

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import warp as wp
@@ -110,16 +108,15 @@ def test_outer_garments_lie_over_inner_ones(asset):
     assert nearest[1] > nearest[0] + 0.5 * LAYER
 
 
-def test_a_garment_is_made_once(asset, monkeypatch, tmp_path):
+def test_a_garment_is_made_once(asset, monkeypatch, empty_kernel_cache):
     """Check that a second time it is read from its file, bit for bit, and made anew for another fabric."""
     monkeypatch.setattr(result_cache, "LEAST_SECONDS", 0.0)
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     calls = []
     usual = tailor._made
     monkeypatch.setattr(tailor, "_made", lambda *given: calls.append(given) or usual(*given))
     monkeypatch.setattr(tailor, "drape", lambda garment, *_: garment.draped)
     first, again = made(asset, "skirt"), made(asset, "skirt")
-    assert len(calls) == 1 and len(list(Path(tmp_path).rglob("garment_*.npz"))) == 1
+    assert len(calls) == 1 and len(list(empty_kernel_cache.rglob("garment_*.npz"))) == 1
     assert np.array_equal(first.draped, again.draped) and np.array_equal(first.mesh.edges, again.mesh.edges)
     assert again.mesh.num_vertices == len(again.draped) and again.thickness == first.thickness
     made(asset, "skirt", "silk")

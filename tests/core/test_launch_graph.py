@@ -151,20 +151,18 @@ def written_by_its_own_module() -> list[int]:
 
 
 @pytest.mark.parametrize("content", [b"", b"damaged"])
-def test_damaged_objects_of_the_cache_are_compiled_anew(tmp_path, monkeypatch, content):
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+def test_damaged_objects_of_the_cache_are_compiled_anew(empty_kernel_cache, content):
     assert written_by_its_own_module() == [0, 1, 2]
     for suffix in (".o", ".meta"):
-        [path] = tmp_path.rglob(f"*{suffix}")
+        [path] = empty_kernel_cache.rglob(f"*{suffix}")
         path.write_bytes(content)
         assert written_by_its_own_module() == [0, 1, 2]
         assert path.read_bytes() != content
 
 
-def test_a_cache_that_cannot_be_written_is_named_with_the_remedy(tmp_path, monkeypatch):
-    (tmp_path / "file").touch()
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "file" / "cache"))
-    with pytest.raises(KernelCacheError, match=r"file/cache .*WARP_CACHE_PATH") as caught:
+def test_a_cache_that_cannot_be_written_is_named_with_the_remedy(empty_kernel_cache):
+    empty_kernel_cache.touch()  # a file in the folder's place
+    with pytest.raises(KernelCacheError, match=r"kernel_cache .*WARP_CACHE_PATH") as caught:
         written_by_its_own_module()
     assert "\n" not in str(caught.value)
     write_index.module.unload()

@@ -8,19 +8,15 @@ import os
 
 import numpy as np
 import pytest
-import warp as wp
 
 from piavatar_envs.core import result_cache
-from piavatar_envs.core.kernel_cache import init_warp
 from piavatar_envs.core.result_cache import digest_of, kept
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    init_warp()
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+def folder(empty_kernel_cache, monkeypatch):
     monkeypatch.setattr(result_cache, "LEAST_SECONDS", 0.0)
-    return tmp_path / result_cache.FOLDER
+    return empty_kernel_cache / result_cache.FOLDER
 
 
 @dataclasses.dataclass

@@ -225,8 +225,8 @@ def thrown(make_env, hero):
 @pytest.mark.parametrize(("site", "region"), [("hair", HAIR), ("cloth", CLOTH)])
 def test_softer_regions_are_dented_more_and_throw_back_less(thrown, site, region):
     # A blow of m v^2 / 2 on an elastic layer dents it by about E^(-1/2), until what lies beneath takes part.
-    hard, medium, soft = (thrown(site, region | {"young_modulus": young}) for young in (4.0e5, 2.5e4, 1.0e3))
-    assert 2.0 < medium[0] / hard[0] < 8.0  # about 4
+    hard, medium, soft = (thrown(site, region | {"young_modulus": young}) for young in (1.0e5, 2.5e4, 1.0e3))
+    assert 1.4 < medium[0] / hard[0] < 2.8  # about 2
     assert soft[0] > 1.1 * medium[0]
     assert soft[1] > hard[1] + 0.05  # velocity along the throw, negative after a rebound
 

@@ -40,8 +40,8 @@ def test_a_world_that_was_tuned_is_one_that_was_built_so(device):
     def apart(first: BatchEnv, second: BatchEnv) -> float:
         return float(np.sqrt(np.mean((first.simulation.state.x.numpy() - second.simulation.state.x.numpy()) ** 2)))
 
-    # moduli are rounded twice
-    assert apart(tuned, built) < 0.02 * apart(left, built)
+    # the softer world retains more short waves in as many substeps; without any one of the settings 0.058 or more
+    assert apart(tuned, built) < 0.04 * apart(left, built)
 
 
 def test_gravity_acts_from_the_next_step_on(device):

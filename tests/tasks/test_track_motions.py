@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import warp as wp
 
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.avatar.body.sources import load_asset
@@ -159,8 +158,8 @@ def test_a_state_knows_the_files_of_its_folder(make_env, folder, tmp_path):
         other.set_state(state)
 
 
+@pytest.mark.usefixtures("empty_kernel_cache")
 def test_what_took_long_to_read_is_kept_until_a_file_changes(monkeypatch, folder, tmp_path):
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
     monkeypatch.setattr(result_cache, "LEAST_SECONDS", 0.0)
     own = tmp_path / "own"
     shutil.copytree(folder, own)
