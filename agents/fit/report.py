@@ -78,11 +78,11 @@ def summary(space: Space, best: Best | None, trials: Sequence[Trial], maximize: 
 def best_settings(player: Player, values: dict[str, float]) -> EnvConfig:
     """Return the settings of a trial, as ``gym.make`` takes them.
 
-    Where trials share builds, whose time step is that of whole ranges, its number of substeps is set.
+    Where trials share builds, whose time step is that of whole ranges, its substeps are set.
     """
     settings = player.space.settings(values)
     if any(axis.name in FACTORS for axis in player.space.shared):
-        return replace(settings, {"physics.num_substeps": player.substeps(values)})
+        return replace(settings, player.time_step(values))
     return settings
 
 

@@ -113,11 +113,12 @@ class Player:
             host.close()
         return self.world
 
-    def substeps(self, values: Values) -> int:
-        """Return the number of substeps of a control step in the build of a trial."""
+    def time_step(self, values: Values) -> dict[str, int]:
+        """Return the substeps of the build of a trial, and those whose damping they keep, as settings."""
         host = self._build([values], threads=1)
         host.close()
-        return host.groups[0].simulation.model.num_substeps
+        model = host.groups[0].simulation.model
+        return {f"physics.{name}": getattr(model, name) for name in ("num_substeps", "reference_substeps")}
 
     def play(self, trials: Sequence[Values], wanted: Sequence[int]) -> Iterator[tuple[int, list[Episode]]]:
         """Play the ``wanted`` of the trials and yield their indices, in order, and their episodes.

@@ -143,6 +143,13 @@ class PhysicsConfig(BaseModel):
     num_substeps: int | None = Field(
         None, ge=1, le=MOST_SUBSTEPS, description="substeps per control step; null chooses them from the CFL limit"
     )
+    reference_substeps: int | None = Field(
+        None,
+        ge=1,
+        le=MOST_SUBSTEPS,
+        description="substeps per control step whose damping of short waves further ones keep, which costs a second "
+        "transfer; null takes those of elastic flesh; from `num_substeps` on every substep damps them",
+    )
     cfl: float = Field(
         0.5,
         gt=0.0,

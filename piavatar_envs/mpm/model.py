@@ -367,6 +367,7 @@ def build_model(
         boundaries=make_boundaries(colliders, fields.num_fields, num_envs, device),
         contact=fields.upload(grid.dx, num_envs, device),
         num_substeps=num_substeps,
+        reference_substeps=reference_substeps,
         control_dt=control_dt,
         sound_speed=sound_speed,
         moving_boundaries=any(collider.moves or collider.kinematic for collider in colliders),

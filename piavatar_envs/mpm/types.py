@@ -259,6 +259,7 @@ class Model:
         boundaries: colliders.
         contact: velocity fields.
         num_substeps: substeps of a control step.
+        reference_substeps: substeps whose damping of short waves further ones keep; None where each damps them.
         control_dt: control step [s].
         sound_speed: fastest elastic wave of any particle [m/s].
         moving_boundaries: whether a collider may have a velocity.
@@ -280,6 +281,7 @@ class Model:
     boundaries: Boundaries
     contact: Contact
     num_substeps: int
+    reference_substeps: int | None
     control_dt: float
     sound_speed: float
     moving_boundaries: bool

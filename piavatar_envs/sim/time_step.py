@@ -96,12 +96,14 @@ def reference_substeps(
     dx: float,
     wave: float,
 ) -> int:
-    """Return the substeps per control step whose damping of short waves further ones keep, whatever is configured.
+    """Return the substeps per control step whose damping of short waves further ones keep.
 
-    They are those of elastic flesh and moving parts at the usual Courant number (:mod:`piavatar_envs.mpm.retention`).
-    ``wave`` is the speed of the fastest elastic wave, of the avatars and what they wear alone [m/s]; the other
-    arguments are those of :func:`choose_substeps`.
+    Unless they are set, they are those of elastic flesh and moving parts at the usual Courant number, whatever
+    ``num_substeps`` and ``cfl`` (:mod:`piavatar_envs.mpm.retention`). ``wave`` is the speed of the fastest elastic
+    wave, of the avatars and what they wear alone [m/s]; the other arguments are those of :func:`choose_substeps`.
     """
+    if config.physics.reference_substeps is not None:
+        return config.physics.reference_substeps
     speed = max(wave, USUAL_CFL * _moving_speed(config, scene, domain, flesh, solids, impulses))
     return max(_least(config, flesh), choose_num_substeps(config.physics.control_dt, dx, speed, USUAL_CFL))
 

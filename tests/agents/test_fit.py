@@ -140,7 +140,7 @@ def test_a_shared_build_gives_every_trial_what_a_build_of_its_own_does(device):
     # and so does a build with the settings themselves, but for rounding
     settings = space.settings(trials[1])
     assert settings.randomize.stiffness_factor == (trials[1]["randomize.stiffness_factor"],) * 2
-    env = gym.make(config.env_id, config=settings, device=device, num_substeps=player.substeps(trials[1]))
+    env = gym.make(config.env_id, config=settings, device=device, **player.time_step(trials[1]))
     env.reset(seed=0)
     for _ in range(3):
         env.step(np.zeros(env.action_space.shape, np.float32))

@@ -25,12 +25,9 @@ def batch(device: str, **settings) -> BatchEnv:
 def test_a_world_that_was_tuned_is_one_that_was_built_so(device):
     """Change friction, tone, alpha and stiffness before the first step: the states are those of another world."""
     values = {STIFFNESS: 4.0e4, FRICTION: 0.2, TONE: 0.4, ALPHA: 0.7}
-    # as many substeps as stiffer flesh needs
-    tuned, built, left = (
-        batch(device, num_substeps=12),
-        batch(device, num_substeps=12, **values),
-        batch(device, num_substeps=12),
-    )
+    # as many substeps as stiffer flesh needs, each damping short waves
+    step = {"num_substeps": 12, "reference_substeps": 12}
+    tuned, built, left = batch(device, **step), batch(device, **step, **values), batch(device, **step)
     tuned.tune(values)
     for env in (tuned, built, left):
         env.action.fill_(0.6)
@@ -40,8 +37,8 @@ def test_a_world_that_was_tuned_is_one_that_was_built_so(device):
     def apart(first: BatchEnv, second: BatchEnv) -> float:
         return float(np.sqrt(np.mean((first.simulation.state.x.numpy() - second.simulation.state.x.numpy()) ** 2)))
 
-    # the softer world retains more short waves in as many substeps; without any one of the settings 0.058 or more
-    assert apart(tuned, built) < 0.04 * apart(left, built)
+    # moduli are rounded twice
+    assert apart(tuned, built) < 0.02 * apart(left, built)
 
 
 def test_gravity_acts_from_the_next_step_on(device):
