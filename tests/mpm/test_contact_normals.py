@@ -66,7 +66,10 @@ def look_at_nodes(
 
 
 class Look:
-    """Normals, gaps [m], reduced volumes and positions of the nodes that two bodies share."""
+    """Normals, gaps [m], reduced volumes and positions of the nodes that two bodies share.
+
+    The path of ``sim`` must not be ``"block"``, whose grid lies in shared memory.
+    """
 
     def __init__(self, sim) -> None:
         model, state, scratch = sim.model, sim.state, sim.scratch
@@ -111,7 +114,7 @@ def test_a_third_body_turns_no_normal(meet, apart):
     # One beside the other two, on both, ``apart`` [grid spacings]; it shares blocks and nodes with either.
     side = {"box": ((0.2 + apart * DX, -0.1, -0.1), (0.3 + apart * DX, 0.1, 0.1))}
     pair = [{"box": box} for box in HALVES]
-    two, three = Look(meet(pair)), Look(meet([*pair, side], max_active_blocks=400))
+    two, three = Look(meet(pair, path="plain")), Look(meet([*pair, side], max_active_blocks=400, path="plain"))
     assert len(two.position) == len(three.position) > 100
     first, second = (np.lexsort(np.round(look.position / DX).T) for look in (two, three))
     np.testing.assert_allclose(three.position[second], two.position[first], atol=1e-6)
@@ -123,7 +126,7 @@ def test_a_third_body_turns_no_normal(meet, apart):
 def test_gap_of_flat_faces(meet, gap, density):
     # Every node far from the faces' edges sees the same gap, wherever it lies, whatever the bodies weigh.
     upper = tuple(tuple(np.add(corner, (0.0, 0.0, gap * DX))) for corner in HALVES[0])
-    look = Look(meet([{"box": upper, "density": 100.0 * density}, {"box": HALVES[1]}]))
+    look = Look(meet([{"box": upper, "density": 100.0 * density}, {"box": HALVES[1]}], path="plain"))
     inner = (np.abs(look.position[:, :2]) < 0.06).all(1)
     assert inner.sum() >= 8 and np.ptp(look.position[inner, 2]) > 0.9 * DX
     np.testing.assert_allclose(look.normal[inner], np.tile([0.0, 0.0, -1.0], (inner.sum(), 1)), atol=1e-3)
