@@ -90,6 +90,12 @@ class Rig:
                 return
         raise ValueError(f"a control step has {count} launches of {kernel} fewer than asked for")
 
+    def run_substeps(self, count: int) -> None:
+        """Run the first substeps of a control step."""
+        names = {name for name, _ in self.step_graph.launches}
+        (last,) = names & {"g2p", "tiled_g2p", "substep_in_small_arena", "substep_in_large_arena"}
+        self.run_part_of_step(last, count)
+
     def run_controller(self) -> None:
         """Run a control step up to the first MPM substep."""
         self.run_part_of_step("command_body" if self.controller.in_one_launch else "apply_corrections", 1)

@@ -21,7 +21,7 @@ def test_a_joint_moves_on_an_arc_at_constant_speed(make_rig):
     pose = np.zeros((22, 3))
     pose[joint_index("left_shoulder"), 2] = 1.2
     rig.command(pose)
-    rig.run_part_of_step("g2p", 10)
+    rig.run_substeps(10)
     np.testing.assert_allclose(
         rig.read("x"), rig.skinned(Rotation.from_rotvec(pose / 2).as_matrix(), rig.points.joints[0, 0]), atol=1e-5
     )

@@ -44,7 +44,7 @@ def test_the_papers_shape_preservation_breaks_momentum(make_rig):
             rig.step()
             worst = max(worst, np.linalg.norm(rig.totals().momentum))
         lost[kind] = worst / scale
-    assert lost["physical"] < 5e-6  # what single precision leaves in vk
+    assert lost["physical"] < 1e-5  # what single precision leaves in vk
     assert lost["kinematic"] > 1e-3
 
 
