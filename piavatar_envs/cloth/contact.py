@@ -38,7 +38,7 @@ _NO_LENGTH = wp.constant(1.0e-12)
 
 @wp.struct
 class Touches:
-    """Contact slots, ``(num_envs, slots * V)``: slot ``s`` of vertex ``i`` is ``s V + i``; workspace of a step."""
+    """Contact slots, ``(B, slots * V)``: slot ``s`` of vertex ``i`` is ``s V + i``; workspace of a step, by row."""
 
     slots: int  # 1: the wearer; 2: all other pieces too
     triangle: wp.array2d(dtype=int)  # -1: none within reach
@@ -48,7 +48,7 @@ class Touches:
     normal: wp.array2d(dtype=wp.vec3)
     impulse: wp.array2d(dtype=wp.vec3)  # on the obstacle since the search [N s]
     moment: wp.array2d(dtype=wp.vec3)  # its moment about ``point`` [N m s]
-    near_collider: wp.array2d(dtype=int)  # (num_envs, V) not 0: a collider is within reach
+    near_collider: wp.array2d(dtype=int)  # (B, V) not 0: a collider is within reach
 
 
 @wp.struct
@@ -243,23 +243,24 @@ def book(o: Obstacles, e: int, triangle: int, w: wp.vec3, z: wp.vec3, J: wp.vec3
 
 
 @wp.func
-def book_slot(o: Obstacles, touches: Touches, e: int, k: int):
+def book_slot(o: Obstacles, touches: Touches, e: int, b: int, k: int):
     """Move the impulse of a contact slot to the books of the obstacles."""
-    triangle = touches.triangle[e, k]
+    triangle = touches.triangle[b, k]
     if triangle >= 0:
-        J = touches.impulse[e, k]
+        J = touches.impulse[b, k]
         if wp.length_sq(J) > 0.0:
-            w = touches.weights[e, k]
+            w = touches.weights[b, k]
             weights = wp.vec3(w[0], w[1], 1.0 - w[0] - w[1])
-            book(o, e, triangle, weights, touches.point[e, k], J, touches.moment[e, k])
-            touches.impulse[e, k] = wp.vec3(0.0)
-            touches.moment[e, k] = wp.vec3(0.0)
+            book(o, e, triangle, weights, touches.point[b, k], J, touches.moment[b, k])
+            touches.impulse[b, k] = wp.vec3(0.0)
+            touches.moment[b, k] = wp.vec3(0.0)
 
 
 @wp.func
 def search(
     o: Obstacles,
     e: int,
+    b: int,
     k: int,
     slot: int,
     piece: int,
@@ -274,24 +275,28 @@ def search(
     touches: Touches,
 ):
     """Fill contact slot ``k`` of a vertex at ``z`` until the next search; returns the nearest point."""
-    book_slot(o, touches, e, k)
+    if step == 0:  # the row may hold the contacts of another environment
+        touches.impulse[b, k] = wp.vec3(0.0)
+        touches.moment[b, k] = wp.vec3(0.0)
+    else:
+        book_slot(o, touches, e, b, k)
     begun = float(step) / float(substeps)
     share = float(step + 1) / float(substeps)
     till = wp.min(float(step + look_every) / float(substeps), 1.0)
     at = nearest_point(o, e, share, z, near, step == 0, sees, piece, slot)
-    touches.triangle[e, k] = -1
+    touches.triangle[b, k] = -1
     if at >= 0:
         triangle, w, distance = nearest_triangle(o, e, share, z, at)
         reach = REACH + APPROACH * dt * float(look_every)
         if distance < reach * reach:
             f = o.faces[triangle]
-            a, na = obstacle_patch(o, e, f, begun, w)
-            b, nb = obstacle_patch(o, e, f, till, w)
-            touches.triangle[e, k] = triangle
-            touches.weights[e, k] = wp.vec2(w[0], w[1])
-            touches.point[e, k] = a
-            touches.way[e, k] = (b - a) / (float(substeps) * (till - begun))
-            touches.normal[e, k] = wp.normalize(na + nb)
+            begin, na = obstacle_patch(o, e, f, begun, w)
+            end, nb = obstacle_patch(o, e, f, till, w)
+            touches.triangle[b, k] = triangle
+            touches.weights[b, k] = wp.vec2(w[0], w[1])
+            touches.point[b, k] = begin
+            touches.way[b, k] = (end - begin) / (float(substeps) * (till - begun))
+            touches.normal[b, k] = wp.normalize(na + nb)
     return at
 
 
@@ -324,26 +329,26 @@ def push(p: Pushed, depth: float, n: wp.vec3, goes: wp.vec3, friction: float, po
 
 @wp.func
 def push_by_slot(
-    touches: Touches, e: int, k: int, p: Pushed, since: float, thickness: float, friction: float, pop: float, dt: float
+    touches: Touches, b: int, k: int, p: Pushed, since: float, thickness: float, friction: float, pop: float, dt: float
 ):
     """Return the motion of a vertex after contact slot ``k``, ``since`` substeps after the search."""
-    if touches.triangle[e, k] >= 0:
-        n = vector_at(touches.normal, e, k)
-        goes = vector_at(touches.way, e, k)
-        depth = thickness - wp.dot(p.z - vector_at(touches.point, e, k) - since * goes, n)
+    if touches.triangle[b, k] >= 0:
+        n = vector_at(touches.normal, b, k)
+        goes = vector_at(touches.way, b, k)
+        depth = thickness - wp.dot(p.z - vector_at(touches.point, b, k) - since * goes, n)
         if depth > 0.0:
             return push(p, depth, n, goes, friction, pop, dt)
     return p
 
 
 @wp.func
-def add_to_slot(touches: Touches, e: int, k: int, mass: float, before: Pushed, after: Pushed):
+def add_to_slot(touches: Touches, b: int, k: int, mass: float, before: Pushed, after: Pushed):
     """Add what a vertex lost of its momentum and angular momentum to contact slot ``k``."""
-    about = vector_at(touches.point, e, k)
+    about = vector_at(touches.point, b, k)
     J = mass * (before.u - after.u)
     M = mass * (wp.cross(before.z - about, before.u) - wp.cross(after.z - about, after.u))
-    touches.impulse[e, k] = touches.impulse[e, k] + J
-    touches.moment[e, k] = touches.moment[e, k] + M
+    touches.impulse[b, k] = touches.impulse[b, k] + J
+    touches.moment[b, k] = touches.moment[b, k] + M
 
 
 @wp.func

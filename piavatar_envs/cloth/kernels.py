@@ -14,7 +14,8 @@ get ``c / dt``: a difference of positions in single precision would lose momentu
 Everything is divided by the mass per area: ``w`` is 1 / area, and the multipliers ``l`` are in m^3.
 
 An environment is a CUDA block, or one thread on a CPU. Edges of a color share no vertex, so that no sum depends on the
-order of the threads.
+order of the threads. What a step needs besides the state exists only as often as environments run at the same time:
+once on a CPU, and on a GPU once for each block that it has room for, which takes one environment after the other.
 """
 
 from __future__ import annotations
@@ -56,6 +57,8 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0, "default_grid_
 THREADS = 256
 #: CUDA blocks that share a multiprocessor: more hide more of the latency of its barriers.
 BLOCKS = 4
+#: CUDA blocks of this size that a multiprocessor has room for.
+ROOM = 2048 // THREADS
 #: Shorter edges [m] have no direction.
 _NO_LENGTH = wp.constant(1.0e-12)
 
@@ -104,15 +107,21 @@ class Constants:
 
 @wp.struct
 class Workspace:
-    """Arrays that a control step fills before it reads them."""
+    """Arrays that a control step fills before it reads them, in row ``b`` of ``B``: see :func:`rows_of`."""
 
-    acceleration: wp.array2d(dtype=wp.vec3)  # (num_envs, V) by bending and air [m/s^2]
-    correction: wp.array2d(dtype=wp.vec3)  # (num_envs, V) by the edges in this substep [m]
-    multiplier: wp.array2d(dtype=float)  # (num_envs, M)
-    softness: wp.array2d(dtype=float)  # (num_envs, G) sigma / (E h dt^2)
-    pull: wp.array2d(dtype=wp.vec3)  # (num_envs, H) on a held vertex in this substep [N s]
-    held_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, H) in the control step [N s]
-    held_moment: wp.array2d(dtype=wp.vec3)  # (num_envs, H) about the place at its end [N m s]
+    acceleration: wp.array2d(dtype=wp.vec3)  # (B, V) by bending and air [m/s^2]
+    correction: wp.array2d(dtype=wp.vec3)  # (B, V) by the edges in this substep [m]
+    multiplier: wp.array2d(dtype=float)  # (B, M)
+    softness: wp.array2d(dtype=float)  # (B, G) sigma / (E h dt^2)
+    pull: wp.array2d(dtype=wp.vec3)  # (B, H) on a held vertex in this substep [N s]
+    held_impulse: wp.array2d(dtype=wp.vec3)  # (B, H) in the control step [N s]
+    held_moment: wp.array2d(dtype=wp.vec3)  # (B, H) about the place at its end [N m s]
+
+
+def rows_of(num_envs: int, device: str) -> int:
+    """Return the number of environments that a device may advance at the same time: rows of the workspace."""
+    owner = wp.get_device(device)
+    return min(num_envs, round(ROOM * owner.sm_count) if owner.is_cuda else 1)
 
 
 @wp.func
@@ -159,7 +168,7 @@ def air_acceleration(
 
 @wp.func
 def renew_forces(
-    p: Pattern, c: Constants, fabric: Fabrics, s: ClothState, w: Workspace, e: int, i: int, remaining: int
+    p: Pattern, c: Constants, fabric: Fabrics, s: ClothState, w: Workspace, e: int, b: int, i: int, remaining: int
 ):
     """Store the acceleration of a vertex by bending and air; a held one passes the force on."""
     here = vector_at(s.x, e, i)
@@ -169,11 +178,11 @@ def renew_forces(
     force = fabric.bending[r, g] * bending_force(p, e, i, 0.5 * period, s)
     h = int_at(p.held, i)
     if h >= 0:
-        w.pull[e, h] = w.pull[e, h] + period * force
+        w.pull[b, h] = w.pull[b, h] + period * force
     else:
         a = (float_at(p.inverse_area, i) / fabric.areal_density[r, g]) * force
         a += air_acceleration(p, c, fabric, r, e, i, here, vector_at(s.v, e, i), s.x)
-        set_vector(w.acceleration, e, i, a)
+        set_vector(w.acceleration, b, i, a)
 
 
 @wp.func
@@ -184,7 +193,7 @@ def held_place(p: Pattern, o: Obstacles, e: int, h: int, share: float):
 
 
 @wp.func
-def predict(p: Pattern, c: Constants, o: Obstacles, s: ClothState, w: Workspace, e: int, i: int, share: float):
+def predict(p: Pattern, c: Constants, o: Obstacles, s: ClothState, w: Workspace, e: int, b: int, i: int, share: float):
     """Move a vertex by its velocity and the forces, or with the skin that holds it."""
     h = int_at(p.held, i)
     if h >= 0:
@@ -192,15 +201,24 @@ def predict(p: Pattern, c: Constants, o: Obstacles, s: ClothState, w: Workspace,
         set_vector(s.v, e, i, (z - vector_at(s.x, e, i)) / c.dt)
         set_vector(s.x, e, i, z)
     else:
-        u = vector_at(s.v, e, i) + c.dt * (c.gravity + vector_at(w.acceleration, e, i))
+        u = vector_at(s.v, e, i) + c.dt * (c.gravity + vector_at(w.acceleration, b, i))
         set_vector(s.v, e, i, u)
         set_vector(s.x, e, i, vector_at(s.x, e, i) + c.dt * u)
-    set_vector(w.correction, e, i, wp.vec3(0.0))
+    set_vector(w.correction, b, i, wp.vec3(0.0))
 
 
 @wp.func
 def project_edge(
-    p: Pattern, c: Constants, fabric: Fabrics, s: ClothState, w: Workspace, e: int, r: int, k: int, first: bool
+    p: Pattern,
+    c: Constants,
+    fabric: Fabrics,
+    s: ClothState,
+    w: Workspace,
+    e: int,
+    b: int,
+    r: int,
+    k: int,
+    first: bool,
 ):
     """Correct the two vertices of an edge; ``first`` in a substep the multiplier is 0."""
     edge = p.edges[k]
@@ -208,37 +226,37 @@ def project_edge(
     j = edge[1]
     wi = float_at(p.inverse_area, i)
     wj = float_at(p.inverse_area, j)
-    ci = vector_at(w.correction, e, i)
-    cj = vector_at(w.correction, e, j)
+    ci = vector_at(w.correction, b, i)
+    cj = vector_at(w.correction, b, j)
     d = (vector_at(s.x, e, i) - vector_at(s.x, e, j)) + (ci - cj)
     length = wp.max(wp.length(d), _NO_LENGTH)
     g = int_at(p.edge_garment, k)
-    a = float_at(p.slackness, k) * number_at(w.softness, e, g)
+    a = float_at(p.slackness, k) * number_at(w.softness, b, g)
     before = float(0.0)
     if not first:
-        before = number_at(w.multiplier, e, k)
+        before = number_at(w.multiplier, b, k)
     change = (number_at(p.length, r, k) - length - a * before) / (wi + wj + a)
-    w.multiplier[e, k] = before + change
+    w.multiplier[b, k] = before + change
     d = (change / length) * d
-    set_vector(w.correction, e, i, ci + wi * d)
-    set_vector(w.correction, e, j, cj - wj * d)
+    set_vector(w.correction, b, i, ci + wi * d)
+    set_vector(w.correction, b, j, cj - wj * d)
     if wi == 0.0 or wj == 0.0:
         impulse = (fabric.areal_density[row(e, fabric.areal_density.shape[0]), g] / c.dt) * d
         if wi == 0.0:
             h = int_at(p.held, i)
-            w.pull[e, h] = w.pull[e, h] + impulse
+            w.pull[b, h] = w.pull[b, h] + impulse
         if wj == 0.0:
             h = int_at(p.held, j)
-            w.pull[e, h] = w.pull[e, h] - impulse
+            w.pull[b, h] = w.pull[b, h] - impulse
 
 
 @wp.func
 def touch(
     p: Pattern, c: Constants, fabric: Fabrics, o: Obstacles, boundaries: Boundaries, s: ClothState, w: Workspace,
-    touches: Touches, e: int, i: int, step: int,
+    touches: Touches, e: int, b: int, i: int, step: int,
 ):  # fmt: skip
     """Move a vertex by the corrections and out of obstacles."""
-    correction = vector_at(w.correction, e, i)
+    correction = vector_at(w.correction, b, i)
     g = int_at(p.garment, i)
     moved = Pushed()
     moved.z = vector_at(s.x, e, i) + correction
@@ -249,46 +267,47 @@ def touch(
     if step % c.look_every == 0:
         if p.wearer[g] >= 0:
             s.near[e, i, 0] = search(
-                o, e, i, 0, p.wearer[g], int_at(p.sees, i), moved.z, step, c.substeps, c.look_every, c.dt,
+                o, e, b, i, 0, p.wearer[g], int_at(p.sees, i), moved.z, step, c.substeps, c.look_every, c.dt,
                 s.near[e, i, 0], touches,
             )  # fmt: skip
         if touches.slots == 2:
             s.near[e, i, 1] = search(
-                o, e, k1, 1, p.wearer[g], -1, moved.z, step, c.substeps, c.look_every, c.dt, s.near[e, i, 1], touches
-            )
+                o, e, b, k1, 1, p.wearer[g], -1, moved.z, step, c.substeps, c.look_every, c.dt, s.near[e, i, 1],
+                touches,
+            )  # fmt: skip
         near = is_near_collider(boundaries, e, moved.z, ahead, c.dt * float(c.look_every))
-        touches.near_collider[e, i] = wp.where(near, 1, 0)
+        touches.near_collider[b, i] = wp.where(near, 1, 0)
     since = float(step % c.look_every + 1)
     r = row(e, fabric.friction.shape[0])
     friction = fabric.friction[r, g]
     thickness = p.thickness[g]
-    by_wearer = push_by_slot(touches, e, i, moved, since, thickness, friction, c.pop, c.dt)
+    by_wearer = push_by_slot(touches, b, i, moved, since, thickness, friction, c.pop, c.dt)
     by_others = by_wearer
     if touches.slots == 2:
-        by_others = push_by_slot(touches, e, k1, by_wearer, since, thickness, friction, c.pop, c.dt)
+        by_others = push_by_slot(touches, b, k1, by_wearer, since, thickness, friction, c.pop, c.dt)
     end = by_others
-    if touches.near_collider[e, i] != 0:
+    if touches.near_collider[b, i] != 0:
         end = push_by_colliders(boundaries, e, by_others, ahead, thickness, friction, c.pop, c.dt)
     if end.squeezed == 0 and wp.length_sq(end.normal) > 0.0:
         mass = fabric.areal_density[r, g] * float_at(p.area, i)
-        if touches.triangle[e, i] >= 0:
-            add_to_slot(touches, e, i, mass, moved, by_wearer)
+        if touches.triangle[b, i] >= 0:
+            add_to_slot(touches, b, i, mass, moved, by_wearer)
         if touches.slots == 2:  # noqa: SIM102 - Warp evaluates both sides of an `and`
-            if touches.triangle[e, k1] >= 0:
-                add_to_slot(touches, e, k1, mass, by_wearer, by_others)
+            if touches.triangle[b, k1] >= 0:
+                add_to_slot(touches, b, k1, mass, by_wearer, by_others)
     set_vector(s.x, e, i, end.z)
     set_vector(s.v, e, i, c.keep * end.u)
 
 
 @wp.func
-def collect_pull(p: Pattern, s: ClothState, o: Obstacles, w: Workspace, e: int, h: int):
+def collect_pull(p: Pattern, s: ClothState, o: Obstacles, w: Workspace, e: int, b: int, h: int):
     """Add the impulse on a held vertex in a substep, which acts at its place then."""
     i = p.held_vertex[h]
-    J = w.pull[e, h]
+    J = w.pull[b, h]
     way_to_go = held_place(p, o, e, h, 1.0) - vector_at(s.x, e, i)
-    w.held_impulse[e, h] = w.held_impulse[e, h] + J
-    w.held_moment[e, h] = w.held_moment[e, h] - wp.cross(way_to_go, J)
-    w.pull[e, h] = wp.vec3(0.0)
+    w.held_impulse[b, h] = w.held_impulse[b, h] + J
+    w.held_moment[b, h] = w.held_moment[b, h] - wp.cross(way_to_go, J)
+    w.pull[b, h] = wp.vec3(0.0)
 
 
 @wp.func
@@ -299,26 +318,28 @@ def inverse_mass(p: Pattern, fabric: Fabrics, r: int, i: int):
 
 @wp.func
 def search_all_selves(
-    p: Pattern, c: Constants, s: ClothState, w: Workspace, contacts: SelfContacts, e: int, thread: int, threads: int
-):
+    p: Pattern, c: Constants, s: ClothState, w: Workspace, contacts: SelfContacts, e: int, b: int, thread: int,
+    threads: int,
+):  # fmt: skip
     """Search the triangles that vertices may touch until the next search; all threads of a block call this."""
     for n in range(thread, contacts.first.shape[1], threads):
-        contacts.first[e, n] = -1
+        contacts.first[b, n] = -1
     sync_block()
     for i in range(thread, s.x.shape[1], threads):
-        insert_vertex(contacts, e, i, corrected(s.x, w.correction, e, i))
+        insert_vertex(contacts, b, i, corrected(s.x, w.correction, e, b, i))
     sync_block()
     for i in range(thread, s.x.shape[1], threads):
         reach = p.thickness[int_at(p.garment, i)] + APPROACH * c.dt * float(c.look_every)
-        search_self(contacts, p.fan_start, p.fan, s.x, w.correction, e, i, reach)
+        search_self(contacts, p.fan_start, p.fan, s.x, w.correction, e, b, i, reach)
 
 
 @wp.func
 def push_self(
-    p: Pattern, c: Constants, fabric: Fabrics, s: ClothState, w: Workspace, contacts: SelfContacts, e: int, i: int
-):
+    p: Pattern, c: Constants, fabric: Fabrics, s: ClothState, w: Workspace, contacts: SelfContacts, e: int, b: int,
+    i: int,
+):  # fmt: skip
     """Push a vertex and the triangle that it touches apart."""
-    f = contacts.corners[e, i]
+    f = contacts.corners[b, i]
     if f[0] >= 0:
         r = row(e, fabric.areal_density.shape[0])
         g = int_at(p.garment, i)
@@ -329,19 +350,19 @@ def push_self(
             inverse_mass(p, fabric, r, f[2]),
         )
         friction = fabric.friction[r, g]
-        keep_apart(contacts, s.x, w.correction, s.v, masses, e, i, p.thickness[g], friction, c.pop, c.dt)
+        keep_apart(contacts, s.x, w.correction, s.v, masses, e, b, i, p.thickness[g], friction, c.pop, c.dt)
 
 
 @wp.func
-def apply_self(p: Pattern, c: Constants, fabric: Fabrics, w: Workspace, contacts: SelfContacts, e: int, i: int):
+def apply_self(p: Pattern, c: Constants, fabric: Fabrics, w: Workspace, contacts: SelfContacts, e: int, b: int, i: int):
     """Correct a vertex by all of its contacts with cloth; a held one passes the impulse on."""
-    P = take_correction(contacts, e, i)
+    P = take_correction(contacts, b, i)
     h = int_at(p.held, i)
     if h >= 0:
-        w.pull[e, h] = w.pull[e, h] + P / c.dt
+        w.pull[b, h] = w.pull[b, h] + P / c.dt
     else:
         change = inverse_mass(p, fabric, row(e, fabric.areal_density.shape[0]), i) * P
-        set_vector(w.correction, e, i, vector_at(w.correction, e, i) + change)
+        set_vector(w.correction, b, i, vector_at(w.correction, b, i) + change)
 
 
 @wp.func
@@ -359,9 +380,10 @@ def advance(
     contacts: SelfContacts,
     failure: wp.array(dtype=int),
     e: int,
+    b: int,
     self_collision: bool,
 ):
-    """Advance the cloth of an environment by a control step, unless it has failed."""
+    """Advance the cloth of an environment by a control step in row ``b`` of the workspace, unless it has failed."""
     if failure[e] != 0:
         return
     thread = thread_of_block()
@@ -370,56 +392,56 @@ def advance(
     r = row(e, p.length.shape[0])
     q = row(e, fabric.stretch.shape[0])
     for g in range(thread, p.wearer.shape[0], threads):
-        w.softness[e, g] = fabric.areal_density[q, g] / (fabric.stretch[q, g] * c.dt * c.dt)
+        w.softness[b, g] = fabric.areal_density[q, g] / (fabric.stretch[q, g] * c.dt * c.dt)
     for h in range(thread, p.held_vertex.shape[0], threads):
-        w.pull[e, h] = wp.vec3(0.0)
-        w.held_impulse[e, h] = wp.vec3(0.0)
-        w.held_moment[e, h] = wp.vec3(0.0)
+        w.pull[b, h] = wp.vec3(0.0)
+        w.held_impulse[b, h] = wp.vec3(0.0)
+        w.held_moment[b, h] = wp.vec3(0.0)
     sync_block()
     for step in range(c.substeps):
         share = float(step + 1) / float(c.substeps)
         if step % c.forces_every == 0:
             for i in range(thread, vertices, threads):
-                renew_forces(p, c, fabric, s, w, e, i, c.substeps - step)
+                renew_forces(p, c, fabric, s, w, e, b, i, c.substeps - step)
             sync_block()
         for i in range(thread, vertices, threads):
-            predict(p, c, o, s, w, e, i, share)
+            predict(p, c, o, s, w, e, b, i, share)
         sync_block()
         for sweep in range(c.sweeps):
             for color in range(p.color_start.shape[0] - 1):
                 for k in range(p.color_start[color] + thread, p.color_start[color + 1], threads):
-                    project_edge(p, c, fabric, s, w, e, r, k, sweep == 0)
+                    project_edge(p, c, fabric, s, w, e, b, r, k, sweep == 0)
                 sync_block()
         if self_collision:
             if step % c.look_every == 0:
-                search_all_selves(p, c, s, w, contacts, e, thread, threads)
+                search_all_selves(p, c, s, w, contacts, e, b, thread, threads)
             for i in range(thread, vertices, threads):
-                push_self(p, c, fabric, s, w, contacts, e, i)
+                push_self(p, c, fabric, s, w, contacts, e, b, i)
             sync_block()
             for i in range(thread, vertices, threads):
-                apply_self(p, c, fabric, w, contacts, e, i)
+                apply_self(p, c, fabric, w, contacts, e, b, i)
             sync_block()
         for i in range(thread, vertices, threads):
             if int_at(p.held, i) < 0:
-                touch(p, c, fabric, o, boundaries, s, w, touches, e, i, step)
+                touch(p, c, fabric, o, boundaries, s, w, touches, e, b, i, step)
         for h in range(thread, p.held_vertex.shape[0], threads):
-            collect_pull(p, s, o, w, e, h)
+            collect_pull(p, s, o, w, e, b, h)
         sync_block()
     finite = bool(True)
     for i in range(thread, vertices, threads):
         for slot in range(touches.slots):
-            book_slot(o, touches, e, slot * vertices + i)
+            book_slot(o, touches, e, b, slot * vertices + i)
         finite = finite and wp.isfinite(s.x[e, i]) and wp.isfinite(s.v[e, i])
     for h in range(thread, p.held_vertex.shape[0], threads):
         z = vector_at(s.x, e, p.held_vertex[h])
-        book(o, e, p.held_triangle[h], p.held_weights[h], z, w.held_impulse[e, h], w.held_moment[e, h])
+        book(o, e, p.held_triangle[h], p.held_weights[h], z, w.held_impulse[b, h], w.held_moment[b, h])
     if not finite:
         wp.atomic_or(failure, e, failure_bit)
 
 
 @cache
 def advance_kernel(self_collision: bool) -> wp.Kernel:
-    """Return :func:`advance` as a kernel over ``(num_envs, threads)``, created on first use."""
+    """Return :func:`advance` as a kernel over ``(B, threads)``, created on first use; a block has every B-th env."""
 
     @wp.kernel(
         name="advance_cloth_apart" if self_collision else "advance_cloth",
@@ -441,7 +463,9 @@ def advance_kernel(self_collision: bool) -> wp.Kernel:
         contacts: SelfContacts,
         failure: wp.array(dtype=int),
     ):
-        e, _ = wp.tid()
-        advance(p, c, fabric, boundaries, failure_bit, o, s, w, touches, contacts, failure, e, self_collision)
+        b, _ = wp.tid()
+        rows = w.softness.shape[0]
+        for e in range(b, failure.shape[0], rows):
+            advance(p, c, fabric, boundaries, failure_bit, o, s, w, touches, contacts, failure, e, b, self_collision)
 
     return advance_cloth

@@ -37,26 +37,26 @@ _FAR = wp.constant(1.0e30)
 
 @wp.struct
 class SelfContacts:
-    """Workspace of an environment: a hash table of ``B`` buckets and a contact of each vertex."""
+    """Workspace of a step in row ``b`` of ``B``: a hash table of ``N`` buckets and a contact of each vertex."""
 
     cell: float  # [m]
-    first: wp.array2d(dtype=int)  # (num_envs, B) a vertex in a bucket, -1 for none
-    next: wp.array2d(dtype=int)  # (num_envs, V) another one in the same bucket
-    corners: wp.array2d(dtype=wp.vec3i)  # (num_envs, V) triangle in contact; the first is -1 for none
-    weights: wp.array2d(dtype=wp.vec3)  # (num_envs, V) of its corners
-    side: wp.array2d(dtype=float)  # (num_envs, V) 1 in front of the triangle, -1 behind it
-    sums: wp.array3d(dtype=wp.int64)  # (num_envs, V, 3) corrections times mass, in quanta
+    first: wp.array2d(dtype=int)  # (B, N) a vertex in a bucket, -1 for none
+    next: wp.array2d(dtype=int)  # (B, V) another one in the same bucket
+    corners: wp.array2d(dtype=wp.vec3i)  # (B, V) triangle in contact; the first is -1 for none
+    weights: wp.array2d(dtype=wp.vec3)  # (B, V) of its corners
+    side: wp.array2d(dtype=float)  # (B, V) 1 in front of the triangle, -1 behind it
+    sums: wp.array3d(dtype=wp.int64)  # (B, V, 3) corrections times mass, in quanta
 
 
-def allocate_self_contacts(mesh: ClothMesh, num_envs: int, device: str, enabled: bool) -> SelfContacts:
+def allocate_self_contacts(mesh: ClothMesh, rows: int, device: str, enabled: bool) -> SelfContacts:
     """Allocate the workspace; without entries if it is not ``enabled``."""
     vertices = mesh.num_vertices if enabled else 0
     buckets = buckets_of(vertices) if enabled else 0
-    shape = (num_envs, vertices)
+    shape = (rows, vertices)
     return fill(
         SelfContacts(),
         cell=REACH_IN_EDGES * float(np.median(mesh.length)),
-        first=wp.full((num_envs, buckets), -1, dtype=int, device=device),
+        first=wp.full((rows, buckets), -1, dtype=int, device=device),
         next=wp.zeros(shape, dtype=int, device=device),
         corners=wp.full(shape, wp.vec3i(-1, -1, -1), dtype=wp.vec3i, device=device),
         weights=wp.zeros(shape, dtype=wp.vec3, device=device),
@@ -76,9 +76,9 @@ def bytes_of_self_contact(mesh: ClothMesh) -> int:
 
 
 @wp.func
-def corrected(x: wp.array2d(dtype=wp.vec3), correction: wp.array2d(dtype=wp.vec3), e: int, i: int):
+def corrected(x: wp.array2d(dtype=wp.vec3), correction: wp.array2d(dtype=wp.vec3), e: int, b: int, i: int):
     """Return the position of a vertex after the corrections by edges [m]."""
-    return vector_at(x, e, i) + vector_at(correction, e, i)
+    return vector_at(x, e, i) + vector_at(correction, b, i)
 
 
 @wp.func
@@ -96,10 +96,10 @@ def cell_of(contacts: SelfContacts, z: wp.vec3):
 
 
 @wp.func
-def insert_vertex(contacts: SelfContacts, e: int, i: int, z: wp.vec3):
+def insert_vertex(contacts: SelfContacts, b: int, i: int, z: wp.vec3):
     """Add a vertex to the list of its bucket."""
     c = cell_of(contacts, z)
-    contacts.next[e, i] = wp.atomic_exch(contacts.first, e, bucket_of(contacts, c[0], c[1], c[2]), i)
+    contacts.next[b, i] = wp.atomic_exch(contacts.first, b, bucket_of(contacts, c[0], c[1], c[2]), i)
 
 
 @wp.func
@@ -115,97 +115,97 @@ def is_neighbor(fan_start: wp.array(dtype=int), fan: wp.array(dtype=wp.vec2i), i
 @wp.func
 def nearest_vertex(
     contacts: SelfContacts, fan_start: wp.array(dtype=int), fan: wp.array(dtype=wp.vec2i),
-    x: wp.array2d(dtype=wp.vec3), correction: wp.array2d(dtype=wp.vec3), e: int, i: int, z: wp.vec3,
+    x: wp.array2d(dtype=wp.vec3), correction: wp.array2d(dtype=wp.vec3), e: int, b: int, i: int, z: wp.vec3,
 ):  # fmt: skip
     """Return the nearest vertex within reach that is no neighbor, the lower one of equals; -1 for none."""
     found = int(-1)
     best = float(contacts.cell * contacts.cell)
     c = cell_of(contacts, z)
     for n in range(27):
-        j = int(contacts.first[e, bucket_of(contacts, c[0] + n % 3 - 1, c[1] + n // 3 % 3 - 1, c[2] + n // 9 - 1)])
+        j = int(contacts.first[b, bucket_of(contacts, c[0] + n % 3 - 1, c[1] + n // 3 % 3 - 1, c[2] + n // 9 - 1)])
         while j >= 0:
-            distance = wp.length_sq(corrected(x, correction, e, j) - z)
+            distance = wp.length_sq(corrected(x, correction, e, b, j) - z)
             nearer = distance < best or (distance == best and j < found)
             if nearer and j != i:  # noqa: SIM102 - Warp evaluates both sides of an `and`
                 if not is_neighbor(fan_start, fan, i, j):
                     best = distance
                     found = j
-            j = contacts.next[e, j]
+            j = contacts.next[b, j]
     return found
 
 
 @wp.func
 def search_self(
     contacts: SelfContacts, fan_start: wp.array(dtype=int), fan: wp.array(dtype=wp.vec2i),
-    x: wp.array2d(dtype=wp.vec3), correction: wp.array2d(dtype=wp.vec3), e: int, i: int, reach: float,
+    x: wp.array2d(dtype=wp.vec3), correction: wp.array2d(dtype=wp.vec3), e: int, b: int, i: int, reach: float,
 ):  # fmt: skip
     """Store the triangle that a vertex may touch until the next search: the nearest one, if the vertex is over it."""
-    z = corrected(x, correction, e, i)
-    contacts.corners[e, i] = wp.vec3i(-1, -1, -1)
-    j = nearest_vertex(contacts, fan_start, fan, x, correction, e, i, z)
+    z = corrected(x, correction, e, b, i)
+    contacts.corners[b, i] = wp.vec3i(-1, -1, -1)
+    j = nearest_vertex(contacts, fan_start, fan, x, correction, e, b, i, z)
     if j >= 0:
         best = float(reach * reach)
-        b = corrected(x, correction, e, j)
+        near = corrected(x, correction, e, b, j)
         for k in range(int_at(fan_start, j), int_at(fan_start, j + 1)):
             pair = fan[k]
             if pair[0] != i and pair[1] != i:
-                c = corrected(x, correction, e, pair[0])
-                d = corrected(x, correction, e, pair[1])
-                w = weights_of_nearest(b, c, d, z)
-                away = z - w[0] * b - w[1] * c - w[2] * d
+                c = corrected(x, correction, e, b, pair[0])
+                d = corrected(x, correction, e, b, pair[1])
+                w = weights_of_nearest(near, c, d, z)
+                away = z - w[0] * near - w[1] * c - w[2] * d
                 distance = wp.length_sq(away)
-                along = wp.dot(away, wp.normalize(wp.cross(c - b, d - b)))
+                along = wp.dot(away, wp.normalize(wp.cross(c - near, d - near)))
                 # a vertex beside a border is not in contact with it
                 if distance < best and 2.0 * along * along >= distance:
                     best = distance
-                    contacts.corners[e, i] = wp.vec3i(j, pair[0], pair[1])
-                    contacts.weights[e, i] = w
-                    contacts.side[e, i] = wp.where(along < 0.0, -1.0, 1.0)
+                    contacts.corners[b, i] = wp.vec3i(j, pair[0], pair[1])
+                    contacts.weights[b, i] = w
+                    contacts.side[b, i] = wp.where(along < 0.0, -1.0, 1.0)
 
 
 @wp.func
-def add_correction(contacts: SelfContacts, e: int, i: int, P: wp.vec3):
+def add_correction(contacts: SelfContacts, b: int, i: int, P: wp.vec3):
     """Add a correction times mass [kg m] to a vertex."""
     for axis in range(3):
-        wp.atomic_add(contacts.sums, e, i, axis, wp.int64(wp.rint(_QUANTA * P[axis])))
+        wp.atomic_add(contacts.sums, b, i, axis, wp.int64(wp.rint(_QUANTA * P[axis])))
 
 
 @wp.func
-def take_correction(contacts: SelfContacts, e: int, i: int):
+def take_correction(contacts: SelfContacts, b: int, i: int):
     """Return and clear the sum of a vertex's corrections times mass [kg m]."""
     P = wp.vec3(
-        float(contacts.sums[e, i, 0]) * _QUANTUM,
-        float(contacts.sums[e, i, 1]) * _QUANTUM,
-        float(contacts.sums[e, i, 2]) * _QUANTUM,
+        float(contacts.sums[b, i, 0]) * _QUANTUM,
+        float(contacts.sums[b, i, 1]) * _QUANTUM,
+        float(contacts.sums[b, i, 2]) * _QUANTUM,
     )
     for axis in range(3):
-        contacts.sums[e, i, axis] = wp.int64(0)
+        contacts.sums[b, i, axis] = wp.int64(0)
     return P
 
 
 @wp.func
 def keep_apart(
     contacts: SelfContacts, x: wp.array2d(dtype=wp.vec3), correction: wp.array2d(dtype=wp.vec3),
-    v: wp.array2d(dtype=wp.vec3), inverse_mass: wp.vec4, e: int, i: int, thickness: float, friction: float,
-    pop: float, dt: float,
+    v: wp.array2d(dtype=wp.vec3), inverse_mass: wp.vec4, e: int, b: int, i: int, thickness: float,
+    friction: float, pop: float, dt: float,
 ):  # fmt: skip
     """Push a vertex and its triangle apart where they are nearer than ``thickness``.
 
     ``inverse_mass`` is that of the vertex and of the corners; ``v`` is the velocity before the corrections. The push
     ends the approach and parts the two at ``pop`` at most.
     """
-    f = contacts.corners[e, i]
-    w = contacts.weights[e, i]
-    b = corrected(x, correction, e, f[0])
-    c = corrected(x, correction, e, f[1])
-    d = corrected(x, correction, e, f[2])
-    n = contacts.side[e, i] * wp.normalize(wp.cross(c - b, d - b))
-    away = corrected(x, correction, e, i) - (w[0] * b + w[1] * c + w[2] * d)
+    f = contacts.corners[b, i]
+    w = contacts.weights[b, i]
+    p = corrected(x, correction, e, b, f[0])
+    q = corrected(x, correction, e, b, f[1])
+    r = corrected(x, correction, e, b, f[2])
+    n = contacts.side[b, i] * wp.normalize(wp.cross(q - p, r - p))
+    away = corrected(x, correction, e, b, i) - (w[0] * p + w[1] * q + w[2] * r)
     depth = thickness - wp.dot(away, n)
     if depth > 0.0:
-        way = dt * vector_at(v, e, i) + vector_at(correction, e, i)
+        way = dt * vector_at(v, e, i) + vector_at(correction, b, i)
         for corner in range(3):
-            way -= w[corner] * (dt * vector_at(v, e, f[corner]) + vector_at(correction, e, f[corner]))
+            way -= w[corner] * (dt * vector_at(v, e, f[corner]) + vector_at(correction, b, f[corner]))
         along = wp.dot(way, n)
         out = wp.clamp(pop * dt - along, 0.0, depth)
         slip = way - along * n
@@ -217,6 +217,6 @@ def keep_apart(
             inertia += w[corner] * w[corner] * inverse_mass[corner + 1]
         P = (SHARE / wp.max(inertia, _NO_LENGTH)) * needed
         if wp.isfinite(P):
-            add_correction(contacts, e, i, P)
+            add_correction(contacts, b, i, P)
             for corner in range(3):
-                add_correction(contacts, e, f[corner], -w[corner] * P)
+                add_correction(contacts, b, f[corner], -w[corner] * P)

@@ -9,7 +9,7 @@ import warp as wp
 
 from piavatar_envs.cloth.contact import Touches
 from piavatar_envs.cloth.garment import NO_WEARER, Garment
-from piavatar_envs.cloth.kernels import THREADS, Constants, Pattern, Workspace, advance_kernel
+from piavatar_envs.cloth.kernels import THREADS, Constants, Pattern, Workspace, advance_kernel, rows_of
 from piavatar_envs.cloth.mesh import ClothMesh, joined
 from piavatar_envs.cloth.obstacles import Obstacles
 from piavatar_envs.cloth.self_contact import allocate_self_contacts, bytes_of_self_contact
@@ -169,7 +169,7 @@ class Cloth(Textile):
         self._constants = self._make_constants(gravity)
         self._workspace, self._touches = self._allocate()
         enabled = self.settings.self_collision
-        self._self_contacts = allocate_self_contacts(self.mesh, num_envs, device, enabled)
+        self._self_contacts = allocate_self_contacts(self.mesh, rows_of(num_envs, device), device, enabled)
 
     def record_step(self, graph: LaunchGraph, failure: wp.array, failure_bit: int = FAILURE_CLOTH) -> None:
         """Append the launch that advances the cloth by a control step.
@@ -185,7 +185,7 @@ class Cloth(Textile):
         inputs = [self._pattern, self._constants, self.fabric, self._boundaries, failure_bit]
         changed = [self._obstacles, self.state, self._workspace, self._touches, self._self_contacts, failure]
         kernel = advance_kernel(self.settings.self_collision)
-        graph.launch(kernel, (self.num_envs, threads), inputs, changed, block_dim=threads)
+        graph.launch(kernel, (rows_of(self.num_envs, self.device), threads), inputs, changed, block_dim=threads)
 
     @property
     def threads(self) -> int:
@@ -204,7 +204,8 @@ class Cloth(Textile):
         )
 
     def _allocate(self) -> tuple[Workspace, Touches]:
-        n, vertices, held = self.num_envs, self.mesh.num_vertices, len(self._pattern.held_vertex)
+        n, vertices = rows_of(self.num_envs, self.device), self.mesh.num_vertices
+        held = len(self._pattern.held_vertex)
         # garments without a wearer touch every piece in the second slot
         alone = len(self._obstacles.piece_start) - 1 <= 1 and all(each.wearer != NO_WEARER for each in self.garments)
         slots = 1 if alone else 2
@@ -233,14 +234,18 @@ class Cloth(Textile):
         return workspace, touches
 
 
-def bytes_of_cloth(mesh: ClothMesh, slots: int, self_collision: bool = False) -> int:
-    """Return the memory of a garment in an environment, with ``slots`` contacts a vertex [bytes].
+def bytes_of_cloth(
+    mesh: ClothMesh, slots: int, self_collision: bool = False, num_envs: int = 1, device: str = "cpu"
+) -> int:
+    """Return the memory of a garment in an environment of a batch, with ``slots`` contacts a vertex [bytes].
 
     Lengths of edges that differ by environment are included; the few held vertices are not.
     """
     state, motion, contact = 2 * 12 + 2 * 4, 2 * 12 + 4, 5 * 12 + 2 * 4 + 4
     apart = bytes_of_self_contact(mesh) if self_collision else 0
-    return mesh.num_vertices * (state + motion + slots * contact) + 2 * 4 * mesh.num_edges + apart
+    row = mesh.num_vertices * (motion + slots * contact) + 4 * mesh.num_edges + apart
+    own = mesh.num_vertices * state + 4 * mesh.num_edges
+    return own + -(-row * rows_of(num_envs, device) // num_envs)
 
 
 def first_faces(obstacles: Obstacles) -> np.ndarray:

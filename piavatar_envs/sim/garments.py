@@ -238,7 +238,12 @@ class _Worn:
 
 
 def bytes_of_garments(
-    meshes: Sequence[ClothMesh], flesh: Sequence[Flesh], points: Sequence[PropPoints], self_collision: bool = False
+    meshes: Sequence[ClothMesh],
+    flesh: Sequence[Flesh],
+    points: Sequence[PropPoints],
+    self_collision: bool = False,
+    num_envs: int = 1,
+    device: str = "cpu",
 ) -> int:
     """Estimate the memory of the garments of an environment and of what they touch [bytes]; 0 without garments.
 
@@ -247,13 +252,16 @@ def bytes_of_garments(
         flesh: of all avatars.
         points: of all props.
         self_collision: whether garments keep apart from each other.
+        num_envs: environments of the batch, which share what cloth works in.
+        device: Warp device.
     """
     if not meshes:
         return 0
     surface = len(flesh) * PROXY_VERTICES + sum(min(len(own.vertices), MOST_PROP_VERTICES) for own in points)
     skins = sum(skin_bytes(len(own.points.rest[0])) for own in flesh) + len(meshes) * skin_bytes(0)
     slots = 2 if len(flesh) + len(points) > 1 else 1
-    return bytes_of_obstacles(surface) + skins + sum(bytes_of_cloth(own, slots, self_collision) for own in meshes)
+    cloth = sum(bytes_of_cloth(own, slots, self_collision, num_envs, device) for own in meshes)
+    return bytes_of_obstacles(surface) + skins + cloth
 
 
 @wp.kernel

@@ -236,7 +236,8 @@ class Simulation:
         meshes = [own.mesh for own in self._tailored]
         if self._shells:
             return bytes_of_shells(meshes)
-        return bytes_of_garments(meshes, self.flesh, self._solids, self.config.cloth.self_collision)
+        apart = self.config.cloth.self_collision
+        return bytes_of_garments(meshes, self.flesh, self._solids, apart, self.num_envs, self.device)
 
     def _dress(self) -> WornCloth | None:
         """Allocate the garments, whose fabrics vary as the settings say."""

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 from benchmarks.garments.sheets import LINEN, Run, flat_sheet, garment, hanging_sheet, move, sphere, surfaces
+from piavatar_envs.cloth import kernels
 from piavatar_envs.cloth.solver import bytes_of_cloth
 from piavatar_envs.mpm.colliders import Collider, make_boundaries
 from piavatar_envs.mpm.types import FAILURE_CLOTH
@@ -100,5 +101,37 @@ def test_memory_of_an_environment_is_as_estimated(self_collision):
     structs = cloth.state, cloth._workspace, cloth._touches, cloth._self_contacts
     arrays = [value for struct in structs for value in (getattr(struct, name) for name in struct._cls.vars)]
     used = sum(each.capacity for each in arrays if isinstance(each, wp.array))
-    per_env = bytes_of_cloth(cloth.mesh, 1, self_collision) - 4 * cloth.mesh.num_edges  # lengths are shared here
+    per_env = bytes_of_cloth(cloth.mesh, 1, self_collision, 2) - 4 * cloth.mesh.num_edges  # lengths are shared here
     assert used == pytest.approx(2 * per_env, rel=0.01)
+
+
+def test_what_a_step_works_in_exists_once_for_environments_that_take_turns(monkeypatch):
+    """A GPU takes as many environments at once as it has room for, a CPU takes one; results are the same."""
+    with gpu_on_cpu() as device:
+        at_once = fall(STARTS, device, steps=6)
+        monkeypatch.setattr(kernels, "ROOM", 2.0 / 132)
+        in_turns = fall(STARTS, device, steps=6)
+        assert [len(run.cloth._touches.impulse) for run in (at_once, in_turns)] == [3, 2]
+        for e in range(3):
+            assert results(at_once, e) == results(in_turns, e)
+    plain = fall(STARTS, steps=1).cloth
+    assert len(plain._touches.impulse) == len(plain._workspace.correction) == 1
+    sizes = [bytes_of_cloth(plain.mesh, 1, num_envs=count) for count in (1, 1000)]
+    assert sizes[1] < 0.4 * sizes[0]
+
+
+def test_a_step_reads_nothing_that_another_environment_has_left():
+    def touching(left: float | None) -> Run:
+        ball = sphere(0.08, rings=5)
+        points, faces = flat_sheet(0.2, 0.2, 0.04, z=0.083)
+        run = Run(garment(points, faces, wearer=0, thickness=0.004), obstacles=surfaces(ball)).steps(2)
+        if left is not None:
+            for struct in (run.cloth._workspace, run.cloth._touches):
+                for value in (getattr(struct, name) for name in struct._cls.vars):
+                    if isinstance(value, wp.array):
+                        value.fill_(0 if value.dtype is wp.int32 else left)
+        return run.steps(2)
+
+    expected = results(touching(None), 0)
+    assert touching(None).obstacles.impulse.numpy().any()
+    assert results(touching(1.0), 0) == results(touching(np.nan), 0) == expected

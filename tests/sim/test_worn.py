@@ -173,7 +173,8 @@ def test_memory_is_counted(make_batch):
     simulation = make_batch(REACH, 2, scene={"props": [BALL]}, **WORN).simulation
     garments = simulation.garments
     held = sum(array.capacity for array in arrays_of(garments.cloth, garments.surfaces, *garments._worn, garments))
-    counted = 2 * bytes_of_garments([own.mesh for own in garments.garments], simulation.flesh, simulation.props.points)
+    meshes = [own.mesh for own in garments.garments]
+    counted = 2 * bytes_of_garments(meshes, simulation.flesh, simulation.props.points, num_envs=2)
     assert counted == pytest.approx(held, rel=0.2)
 
 
