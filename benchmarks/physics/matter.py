@@ -16,6 +16,9 @@ from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_first_activation, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
+from piavatar_envs.sim.prop_cores import PropCores
+from piavatar_envs.sim.prop_geometry import PropPoints
+from piavatar_envs.sim.props import upload_prop
 
 wp.set_module_options({"enable_backward": False})
 
@@ -124,6 +127,7 @@ def build_matter(
     retardation: float = 0.0,
     gravity: Sequence[float] = (0.0, 0.0, 0.0),
     pushed: bool = False,
+    prop: PropPoints | None = None,
     planes: Sequence[tuple[Sequence[float], float, float]] = (),
     colliders: Sequence[Collider] = (),
     device: str = "cpu",
@@ -148,6 +152,7 @@ def build_matter(
         retardation: viscosity over modulus, likewise [s].
         gravity: [m/s^2].
         pushed: whether :meth:`Matter.push` has an effect.
+        prop: a prop that the matter is, whose core thin colliders stop.
         planes: normal, offset [m] and friction [-] of each.
         colliders: further solids.
         device: Warp device.
@@ -164,12 +169,15 @@ def build_matter(
     state, scratch = allocate(model)
     keep = wp.full(1, 1.0, dtype=float, device=device)
     kick = wp.zeros(len(rest), dtype=wp.vec3, device=device)
+    own = [] if prop is None else [prop]
+    cores = PropCores(own, [upload_prop(each, 0, device) for each in own], [0 for _ in own], model)
     graph = LaunchGraph(device)
     if "fields" in kwargs:
         record_begin(graph, model, state, scratch)
     else:  # sensors add up over control steps
         record_first_activation(graph, model, state, scratch)
     for index in range(model.num_substeps):
+        cores.record_before_substep(graph, state, scratch)
         record_substep(graph, model, state, scratch, index)
         if pushed:
             graph.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])

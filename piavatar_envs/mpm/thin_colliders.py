@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from piavatar_envs.mpm.bspline import base_node, grid_position, in_same_subblock, stencil_inside
-from piavatar_envs.mpm.colliders import Collider, half_thickness, slide, solid_distance, surface_velocity, turned
+from piavatar_envs.mpm.colliders import BOX, Collider, half_thickness, slide, solid_distance, surface_velocity, turned
 from piavatar_envs.mpm.contact_sensors import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.sparse_grid import activate_stencil
 from piavatar_envs.mpm.types import (
@@ -39,7 +39,7 @@ wp.set_module_options({"enable_backward": False})
 
 #: Half thickness or radius below which a collider is thin [grid spacings]: contact on the grid alone let a ball at
 #: 9 m/s pass the middle of thinner ones.
-THIN = 1.2
+THIN = wp.constant(1.2)
 #: Distance that particles keep from the surface, far below the gate of contact on the grid, which bears what rests
 #: there; and how far a particle that begins inside moves out in a substep [grid spacings].
 CLEARANCE, MOST_PARTING = wp.constant(1.0e-3), wp.constant(0.05)
@@ -52,6 +52,24 @@ _NEVER = wp.constant(2.0)
 def thin_colliders(colliders: Sequence[Collider], dx: float) -> list[int]:
     """Return the indices of the colliders that are thin on a grid of spacing ``dx`` [m]."""
     return [b for b, each in enumerate(colliders) if half_thickness(each.kind, each.size) < THIN * dx]
+
+
+@wp.func
+def parts_matter(grid: Grid, boundaries: Boundaries, e: int, b: int, x: wp.vec3):
+    """Return whether the part of a thin collider that is nearest to ``x`` may part matter: anything but a wide face."""
+    if boundaries.kind[b] != BOX:
+        return True
+    r = row(e, boundaries.position.shape[0])
+    p = wp.quat_rotate_inv(boundaries.rotation[r, b], x - boundaries.position[r, b])
+    half = boundaries.size[b]
+    beyond = wp.vec3(wp.abs(p[0]) - half[0], wp.abs(p[1]) - half[1], wp.abs(p[2]) - half[2])
+    faces = int(0)
+    narrowest = float(0.0)
+    for axis in range(3):
+        if beyond[axis] > 0.0:
+            faces += 1
+            narrowest = wp.min(half[(axis + 1) % 3], half[(axis + 2) % 3])
+    return faces != 1 or narrowest < THIN * grid.dx
 
 
 @wp.func

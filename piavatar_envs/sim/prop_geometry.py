@@ -32,6 +32,8 @@ SUBDIVISIONS = 3  # points per axis and cell that measure the part of it inside
 OVERLAP_SAMPLES = 20_000  # of the box in which parts of a mesh may overlap
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
 MAX_MISSED = 0.25  # share of a mesh's volume that the lattice may miss or count twice
+CORE, CORE_ERROR, MOST_BALLS = 0.4, 0.1, 32  # the core is deeper than 1 - CORE of the greatest depth; error, balls
+DIAGONAL = 1.8  # of a cell of the lattice of particles
 SEGMENTS = 32  # around a round surface
 RINGS = 8  # from a pole to the equator
 SQUARES = 6  # along each edge of a box
@@ -46,12 +48,19 @@ class PropPoints:
         volume: their volumes [m^3], which add up to the solid's, shape ``(P,)`` float64.
         vertices: surface for pictures [m], shape ``(V, 3)`` float32.
         faces: its triangles, outward, shape ``(T, 3)`` int32.
+        core: balls that fill its innermost part, centre and radius [m], shape ``(B, 4)`` float32.
     """
 
     rest: np.ndarray
     volume: np.ndarray
     vertices: np.ndarray
     faces: np.ndarray
+    core: np.ndarray
+
+    @property
+    def core_reach(self) -> float:
+        """Greatest distance of a point of the core from the centre of mass [m]."""
+        return float((np.linalg.norm(self.core[:, :3], axis=1) + self.core[:, 3]).max())
 
     def __post_init__(self):
         for array in vars(self).values():
@@ -312,10 +321,46 @@ def _particles(solid: _Solid, spacing: float) -> PropPoints:
     rest = _stretched(places, share, solid.spread)
     beyond = solid.distance(rest) > 0.0
     rest[beyond] = places[beyond]
+    core = core_balls(solid.distance, rest, spacing)
     # differs a little from the centre of a coarsely sampled mesh; the surface moves with the particles
     centre = share @ rest
     surface = (solid.vertices - centre).astype(np.float32)
-    return PropPoints((rest - centre).astype(np.float32), share * solid.volume, surface, solid.faces)
+    return PropPoints(
+        (rest - centre).astype(np.float32), share * solid.volume, surface, solid.faces, core - np.append(centre, 0.0)
+    )
+
+
+def core_balls(distance: Callable[[np.ndarray], np.ndarray], places: np.ndarray, spacing: float) -> np.ndarray:
+    """Return balls that fill the core of a solid: all that is deeper than a share of the greatest depth.
+
+    Centres are among the particles, the centre of mass and, in thin solids, the middles between particles. The deepest
+    is the first; of the others, the one whose ball stands out most from those so far is the next.
+
+    Args:
+        distance: signed distance from the surface, negative inside, ``(N, 3)`` to ``(N,)`` [m].
+        places: particles about the centre of mass [m], shape ``(P, 3)``.
+        spacing: of the particles [m].
+
+    Returns:
+        Centres and radii [m], shape ``(B, 4)`` float32.
+    """
+    places = np.vstack([np.zeros(3), places])
+    depth = -distance(places).astype(float)
+    if depth.max() < 2.0 * spacing:
+        pairs = cKDTree(places).query_pairs(DIAGONAL * spacing, output_type="ndarray")
+        middles = places[pairs].mean(axis=1)
+        places, depth = np.vstack([places, middles]), np.append(depth, -distance(middles))
+    deepest = depth.max()
+    places, radius = places[depth > (1.0 - CORE) * deepest], depth[depth > (1.0 - CORE) * deepest]
+    radius -= (1.0 - CORE) * deepest
+    chosen, out = [int(radius.argmax())], np.full(len(radius), np.inf)
+    while len(chosen) < MOST_BALLS:
+        last = chosen[-1]
+        out = np.minimum(out, np.linalg.norm(places - places[last], axis=1) + radius - radius[last])
+        if out.max() <= CORE_ERROR * deepest:
+            break
+        chosen.append(int(out.argmax()))
+    return np.column_stack([places, radius])[chosen].astype(np.float32)
 
 
 def _lattice(solid: _Solid, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:

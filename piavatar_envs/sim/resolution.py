@@ -21,9 +21,10 @@ GRID_PER_HEIGHT: dict[str, float] = {
 }
 #: Least thickness of a prop [grid spacings]: smaller ones stop a quarter of a spacing and more above what they touch.
 LEAST_PROP = 0.5
-#: Speed [m/s] from which colliders below these extents [grid spacings] may cut a soft ball, so that it hangs: plates,
-#: struck at an edge, by their least extent; poles by the middle one; and what is small all around by the greatest.
-CUTTING_SPEED, CUTTING = 5.0, (0.6, 1.2, 2.4)
+#: Extents [grid spacings] below which colliders part the particles of soft bodies, so that only cores and bones stop
+#: them: plates, struck at an edge, by their least extent; poles by the middle one; what is small all around by the
+#: greatest.
+PARTING = (0.6, 1.2, 2.4)
 #: Greatest extent below which a ball at 3 m/s swallows a collider and hangs [grid spacings].
 SWALLOWED = 1.2
 
@@ -34,7 +35,7 @@ def check_sizes(
     colliders: Iterable[ColliderConfig],
     props: Iterable[tuple[PropConfig, PropPoints]],
 ) -> None:
-    """Refuse what is too small for the grid, and warn of colliders that may cut what strikes them fast.
+    """Refuse what is too small for the grid, and warn of colliders that part the particles of what strikes them.
 
     Faces stop matter at any thickness. A pole must be as thick as particles are apart, or matter passes on both sides.
 
@@ -55,11 +56,11 @@ def check_sizes(
             _refuse(what, pole, spacing_for(dx), reason, fidelity)
         if ball < SWALLOWED * dx:
             _refuse(what, ball, SWALLOWED * dx, "of 1.2 grid spacings, so that matter would swallow it", fidelity)
-        for extent, cells, struck in reversed([*zip(extents, CUTTING, ("its edge", "it", "it"), strict=True)]):
+        for extent, cells, struck in reversed([*zip(extents, PARTING, ("its edge", "it", "it"), strict=True)]):
             if extent < cells * dx:
                 warnings.warn(
                     f"{what} is {extent:.2g} m thick, less than {cells * dx:.2g} m: soft bodies that strike {struck} "
-                    f"at more than {CUTTING_SPEED:g} m/s may be cut and hang; "
+                    f"fast are dented too deeply, as far as the core of a prop or the bones, and rebound too slowly; "
                     f"{_remedy(extent, cells * dx, fidelity)}",
                     stacklevel=2,
                 )

@@ -31,6 +31,7 @@ from piavatar_envs.sim.bodies import Flesh, load_avatar, pose_control
 from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_places
 from piavatar_envs.sim.forces import Forces, Receivers
 from piavatar_envs.sim.garments import Garments, WornCloth, bytes_of_garments, tailor, worn_by
+from piavatar_envs.sim.prop_cores import PropCores
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
 from piavatar_envs.sim.randomize import Randomization, fastest_wave, limiting_wave
 from piavatar_envs.sim.resolution import GRID_PER_HEIGHT, check_sizes
@@ -57,6 +58,7 @@ class Simulation:
         state: particles; scratch: grid; sensors: contact of the last control step.
         avatars, controllers: the avatars, and the controller of each.
         props: the soft props.
+        cores: of the props, which thin colliders stop.
         randomization: factors on mass, stiffness and friction, and the constants that they scale.
         shapes: bodies of random shape.
         garments: what the avatars wear; None without garments.
@@ -230,6 +232,7 @@ class Simulation:
         columns = [subject.index(count + index) for index in range(len(self._solids))]
         first = self.subjects.first[count:-1]
         self.props = PropSet(self.scene.props, self._solids, self._prop_matter, first, columns, self.model)
+        self.cores = PropCores(self._solids, self.props.props, columns, self.model)
 
     def _bytes_of_garments(self) -> int:
         """Estimate the memory of the garments of an environment besides their particles [bytes]."""
@@ -282,7 +285,7 @@ class Simulation:
     def record_step(self, graph: LaunchGraph) -> None:
         """Append a control step towards the avatars' goals; see :func:`record_control_step`."""
         simulated = self.avatars, self.controllers, self.model, self.state, self.scratch
-        record_control_step(graph, *simulated, self.props, self.forces, self.garments)
+        record_control_step(graph, *simulated, self.props, self.cores, self.forces, self.garments)
 
     def arrays(self) -> dict[str, wp.array]:
         """Return all arrays of a checkpoint by name."""
@@ -308,6 +311,7 @@ def record_control_step(
     state: State,
     scratch: Scratch,
     props: PropSet | None = None,
+    cores: PropCores | None = None,
     forces: Forces | None = None,
     garments: WornCloth | None = None,
 ) -> None:
@@ -332,6 +336,8 @@ def record_control_step(
             forces.record_before_substep(graph, state, step)
         if garments:
             garments.record_before_substep(graph)
+        if cores:
+            cores.record_before_substep(graph, state, scratch)
         record_substep(graph, *simulated, step)
 
     def end(index: int, own: LaunchGraph) -> None:

@@ -51,7 +51,7 @@ def test_small_colliders_are_refused_and_both_remedies_help(make, cells, fidelit
     with pytest.raises(ConfigError, match=r"collider 'own' is \S+ m thick") as refused:
         check(fidelity, make(thickness))
     larger, finer = remedies(refused.value)
-    with pytest.warns(UserWarning, match="may be cut"):
+    with pytest.warns(UserWarning, match="dented too deeply"):
         check(fidelity, make(larger))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -75,11 +75,11 @@ def test_no_resolution_is_suggested_where_none_helps():
             check("coarse", **refused)
 
 
-def test_colliders_that_may_cut_are_accepted_with_a_warning():
+def test_colliders_that_part_particles_are_accepted_with_a_warning():
     with pytest.warns(UserWarning, match=r"strike its edge .* set fidelity='medium'"):
         check("coarse", ("box", (0.01, 0.5, 0.5)))
     for pole in (("capsule", (0.025, 0.5)), ("sphere", (0.05,))):
-        with pytest.warns(UserWarning, match=r"strike it at .* set fidelity='medium'"):
+        with pytest.warns(UserWarning, match=r"strike it fast .* set fidelity='medium'"):
             check("coarse", pole)
 
 
