@@ -60,7 +60,8 @@ def make_neighbours(links: np.ndarray, count: int, device: str) -> Neighbours:
     """Upload the neighbours of ``count`` particles, from pairs of them, shape ``(L, 2)``."""
     first, second = np.concatenate([links, links[:, ::-1]]).astype(np.int64).T
     pairs = np.sort(first * count + second)
-    arrays = {"particle": pairs % count, "start": np.searchsorted(pairs, count * np.arange(count + 1))}
+    start = np.append(0, np.cumsum(np.bincount(first, minlength=count)))
+    arrays = {"particle": pairs % count, "start": start}
     uploaded = {name: wp.array(v.astype(np.int32), dtype=int, device=device) for name, v in arrays.items()}
     return make_struct(Neighbours, **uploaded)
 

@@ -363,7 +363,7 @@ def build_model(
         device=device,
         grid=grid,
         step=step,
-        particles=upload_points(points, mu, lam, rest, grid.dx, device),
+        particles=upload_points(points, mu, lam, rest if path == "tiled" else None, grid.dx, device),
         boundaries=make_boundaries(colliders, fields.num_fields, num_envs, device),
         contact=fields.upload(grid.dx, num_envs, device),
         num_substeps=num_substeps,

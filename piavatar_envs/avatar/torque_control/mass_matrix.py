@@ -21,6 +21,8 @@ to one: they are those of all matter that the bone moves, which other stages nee
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import warp as wp
 
@@ -158,42 +160,38 @@ class Pairs:
 def build_pairs(points: BodyPoints, device: str) -> Pairs:
     """Build the lists of all pairs of bones that share particles."""
     weights = points.skin_weights / points.skin_weights.sum(1, keepdims=True)
-    particles: dict[tuple[int, int], list[np.ndarray]] = {}
-    products: dict[tuple[int, int], list[np.ndarray]] = {}
-    for i in range(4):
-        for j in range(i + 1, 4):
-            product = weights[:, i] * weights[:, j]
-            bones = np.sort(points.skin_joints[:, [i, j]], axis=1)
-            for a, b in np.unique(bones[product > 0.0], axis=0):
-                found = np.flatnonzero((product > 0.0) & (bones[:, 0] == a) & (bones[:, 1] == b))
-                particles.setdefault((int(a), int(b)), []).append(found)
-                products.setdefault((int(a), int(b)), []).append(product[found])
+    shared, numbers, products = [], [], []  # particles, pairs of bones as numbers, and products of their weights
+    for i, j in combinations(range(weights.shape[1]), 2):
+        product = weights[:, i] * weights[:, j]
+        shared.append(np.flatnonzero(product > 0.0))
+        bones = np.sort(points.skin_joints[shared[-1]][:, [i, j]], axis=1)
+        numbers.append(NUM_JOINTS * bones[:, 0] + bones[:, 1])
+        products.append(product[shared[-1]])
+    particle, number, product = (np.concatenate(found) for found in (shared, numbers, products))
+    order = np.argsort(number.astype(np.uint16), kind="stable")  # 16 bits are sorted by digits, in linear time
+    found, begins = np.unique(number[order], return_index=True)
+    first, second = np.divmod(found, NUM_JOINTS)
     of = np.full((NUM_JOINTS, NUM_JOINTS), -1)
-    chunk_pair, chunk_start, entry_start, entries, entry_weights = [], [0], [0], [], []
-    for pair, (a, b) in enumerate(sorted(particles)):
-        of[a, b] = of[b, a] = pair
-        found, product = np.concatenate(particles[a, b]), np.concatenate(products[a, b])
-        for begin in range(0, len(found), CHUNK):
-            entries.append(found[begin : begin + CHUNK])
-            entry_weights.append(product[begin : begin + CHUNK])
-            entry_start.append(entry_start[-1] + len(entries[-1]))
-            chunk_pair.append(pair)
-        chunk_start.append(len(entry_start) - 1)
+    of[first, second] = of[second, first] = np.arange(len(found))
+    sizes = np.diff([*begins, len(order)])
+    chunks = -(-sizes // CHUNK)
+    chunk_pair = np.repeat(np.arange(len(found)), chunks)
+    within = np.arange(len(chunk_pair)) - np.repeat(np.cumsum(chunks) - chunks, chunks)
+    borders = np.append(begins[chunk_pair] + CHUNK * within, len(order))
     pairs = Pairs()
     lists = {
         "of": of.ravel(),
         "neighbor_start": np.cumsum([0, *(of >= 0).sum(1)]),
         "neighbors": np.nonzero(of >= 0)[1],
-        "first": [a for a, _ in sorted(particles)],
-        "second": [b for _, b in sorted(particles)],
-        "chunk_start": chunk_start,
-        "entry": np.concatenate(entries),
+        "first": first,
+        "second": second,
+        "chunk_start": np.cumsum([0, *chunks]),
+        "entry": particle[order],
     }
-    for name, numbers in lists.items():
-        setattr(pairs, name, wp.array(np.asarray(numbers, np.int32), dtype=int, device=device))
-    pairs.entry_weight = wp.array(np.concatenate(entry_weights).astype(np.float32), dtype=float, device=device)
-    first, borders = np.array(lists["first"])[chunk_pair], np.array(entry_start)
-    quarters = share_chunks(np.arange(len(first)), borders[:-1], borders[1:], first, device)
+    for name, values in lists.items():
+        setattr(pairs, name, wp.array(np.asarray(values, np.int32), dtype=int, device=device))
+    pairs.entry_weight = wp.array(product[order].astype(np.float32), dtype=float, device=device)
+    quarters = share_chunks(np.arange(len(chunk_pair)), borders[:-1], borders[1:], first[chunk_pair], device)
     pairs.quarters = wp.array(quarters, dtype=wp.vec4i, device=device)
     return pairs
 
