@@ -17,7 +17,7 @@ from scripts.page_code import PAGES, ROOT, blocks
 #: Code that takes minutes or a GPU, and its replacement here.
 SMALLER = {
     "for _ in range(150):": "for _ in range(3):",
-    "total_timesteps=50_000, progress_bar=True": "total_timesteps=16",
+    "total_timesteps=50_000": "total_timesteps=16",
     ".learn(100_000)": ".learn(16)",
     "num_envs=1024": "num_envs=2",
     "num_envs=2048": "num_envs=2",
@@ -36,6 +36,7 @@ SMALLER = {
     'Path("reach")': 'FOLDER / "reach"',
     'save("kick.png")': 'save(FOLDER / "kick.png")',
     'save("reach.png")': 'save(FOLDER / "reach.png")',
+    'save("reach_ppo")': 'save(FOLDER / "reach_ppo")',
 }
 
 

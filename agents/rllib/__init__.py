@@ -1,1 +1,1 @@
-"""PPO by RLlib, on one machine or several."""
+"""PPO with RLlib, on one machine or several."""

@@ -1,4 +1,4 @@
-"""PPO by RLlib, on one machine or several: ``python -m agents.rllib.train configs/rllib/reach_rllib.yaml``.
+"""PPO with RLlib, on one machine or several: ``python -m agents.rllib.train configs/rllib/reach_rllib.yaml``.
 
 Starts Ray on this machine, or joins the cluster that ``RAY_ADDRESS`` names. A lost machine does not end the training:
 env runners that are left play all steps, and lost ones are restarted where there are CPUs for them. Leaves in the

@@ -1,4 +1,4 @@
-"""PPO by rsl_rl on a batch of environments: ``python -m agents.rsl_rl.train configs/rsl_rl/reach_rsl.yaml``.
+"""PPO with rsl_rl on a batch of environments: ``python -m agents.rsl_rl.train configs/rsl_rl/reach_rsl.yaml``.
 
 Writes to the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's own saved networks, the
 learning curve, and the evaluation. A killed run continues with ``--resume`` from the latest checkpoint, with the same

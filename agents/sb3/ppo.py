@@ -1,4 +1,4 @@
-"""Proximal Policy Optimization (Schulman et al., 2017) by stable-baselines3: settings and construction.
+"""Proximal Policy Optimization (Schulman et al., 2017) with stable-baselines3: settings and construction.
 
 Observations are not normalised by running statistics: they are metres, radians and metres a second of order one
 already, while some (the height of a root that is held up) hardly vary, and dividing by their spread makes them noise.

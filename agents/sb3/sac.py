@@ -1,4 +1,4 @@
-"""Soft Actor-Critic (Haarnoja et al., 2018) by stable-baselines3: settings and construction.
+"""Soft Actor-Critic (Haarnoja et al., 2018) with stable-baselines3: settings and construction.
 
 It learns from a memory of steps, so that it needs fewer of them than PPO and more arithmetic for each. The weight of
 the entropy adapts to the target -dim(action) (Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2019,

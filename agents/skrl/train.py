@@ -1,4 +1,4 @@
-"""Multi-Agent PPO by skrl on a batch of worlds: ``python -m agents.skrl.train configs/skrl/high_five_mappo.yaml``.
+"""Multi-Agent PPO with skrl on a batch of worlds: ``python -m agents.skrl.train configs/skrl/high_five_mappo.yaml``.
 
 MAPPO (Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games", 2022): every agent has a
 policy of what it sees itself and a critic of what all of them see. Leaves in the folder: the resolved configuration,

@@ -234,7 +234,7 @@ class GetUpTask(Task):
     """Stand up."""
 
     Config = GetUpConfig
-    description = "stand up from lying on the ground, face down or up"
+    description = "get up from the ground, from lying face down or face up"
     observation_terms = UPRIGHT_TERMS
     rewards = (
         Term(

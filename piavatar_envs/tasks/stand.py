@@ -26,7 +26,7 @@ class StandTask(StandingTask):
     """Stand still in the rest pose."""
 
     Config = StandConfig
-    description = "keep balance by joint torques alone"
+    description = "keep balance with joint torques alone"
     summary = """The avatar stands on the ground with its joints slightly bent at random (`pose_noise`). Only its joints
 hold it up: actions are joint targets (`control="pd"`) or torques, and `root_assist` is 0. With the rest pose as a
 constant target the body tips over within two seconds. A good agent presses the balls of the feet or the heels to the

@@ -178,7 +178,7 @@ class WalkTask(Task):
     """Walk straight ahead."""
 
     Config = WalkConfig
-    description = "walk straight ahead at a given speed by joint torques alone"
+    description = "walk straight ahead at a given speed with joint torques alone"
     observation_terms = (
         *UPRIGHT_TERMS,
         ObservationTerm("path_direction", 3, "-", "root", "direction of the path: a unit vector"),

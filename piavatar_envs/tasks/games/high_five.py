@@ -207,7 +207,7 @@ class HighFiveTask(Task):
     """Meet the other's hand with a slap."""
 
     Config = HighFiveConfig
-    description = "two avatars slap one hand each, high up and neither too softly nor too hard"
+    description = "two avatars slap hands, high up and neither too softly nor too hard"
     observation_terms = (
         ObservationTerm("own_hand", 3, "m", "root", "middle of the hand to raise, from the pelvis"),
         ObservationTerm("own_hand_direction", 3, "-", "root", "unit vector from its wrist to its middle"),
