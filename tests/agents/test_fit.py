@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import subprocess
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -33,6 +35,8 @@ STUDY = {
     "trials": 7,
     "startup": 4,
 }
+#: Study that :mod:`tests.agents.killed_study` kills.
+KILLED = {"direction": "minimize", "sampler": "tpe", "trials": 12, "startup": 4, "batch": 2}
 
 
 def study(**changed):
@@ -283,6 +287,21 @@ def test_a_killed_identification_goes_on_with_the_same_trials_and_closes_in(tmp_
     # trial 9 is where the model of the residuals matches best
     assert whole[9].values["scene.props.0.mass"] == pytest.approx(np.e, rel=2e-3)
     assert whole[9].score < 0.1 * min(trial.score for trial in whole[:9])
+
+
+def test_a_study_killed_at_random_moments_has_the_trials_of_one_that_was_not(tmp_path):
+    command = [sys.executable, "-m", "tests.agents.killed_study", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-2000:]
+    config = study(**KILLED)
+    whole, *others = (
+        Study(config, Space(config), folder).trials(True)
+        for folder in (tmp_path / "whole", *sorted(tmp_path.glob("killed_*")))
+    )
+    assert others and len(whole) == KILLED["trials"]
+    for killed in others:
+        assert killed == whole
+        assert all(np.array_equal(one.residuals, other.residuals) for one, other in zip(whole, killed, strict=True))
 
 
 def test_a_file_of_other_settings_or_of_something_else_is_refused(tmp_path):
