@@ -37,7 +37,7 @@ class Options(runner.Options):
     #: resolution of the body
     fidelity: str = "coarse"
     #: diameters of the poles [m]
-    diameters: tuple[float, ...] = (0.04, 0.06, 0.12)
+    diameters: tuple[float, ...] = (0.02, 0.04, 0.06, 0.12)
     #: controls of the body
     controls: tuple[str, ...] = tuple(CONTROLS)
     #: speed of the poles [m/s]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import warnings
 
@@ -23,8 +24,11 @@ BALLS = {
     "capsule": lambda t: ("capsule", (0.4 * t, 0.1 * t)),
     "cube": lambda t: ("box", (t / 2, t / 2, t / 2)),
 }
-COLLIDERS = {f"pole: {name}": (make, 0.57) for name, make in POLES.items()}
-COLLIDERS |= {f"ball: {name}": (make, 1.2) for name, make in BALLS.items()}
+COLLIDERS = [pytest.param("tiny", make, 0.57, id=f"tiny pole: {name}") for name, make in POLES.items()]
+COLLIDERS += [
+    pytest.param(fidelity, make, 1.2, id=f"{fidelity} ball: {name}")
+    for fidelity, (name, make) in itertools.product(("tiny", "coarse", "medium"), BALLS.items())
+]
 PROPS = {
     "sphere": lambda t: sphere(t / 2, 0.02),
     "box": lambda t: box((0.3, t / 2, 0.2), 0.02),
@@ -44,9 +48,8 @@ def remedies(error) -> tuple[float, str]:
     return float(thickness), fidelity
 
 
-@pytest.mark.parametrize(("make", "cells"), COLLIDERS.values(), ids=COLLIDERS)
-@pytest.mark.parametrize("fidelity", ["tiny", "coarse", "medium"])
-def test_small_colliders_are_refused_and_both_remedies_help(make, cells, fidelity):
+@pytest.mark.parametrize(("fidelity", "make", "cells"), COLLIDERS)
+def test_small_colliders_are_refused_and_both_remedies_help(fidelity, make, cells):
     thickness = 0.95 * cells * HEIGHT / GRID_PER_HEIGHT[fidelity]
     with pytest.raises(ConfigError, match=r"collider 'own' is \S+ m thick") as refused:
         check(fidelity, make(thickness))
@@ -78,6 +81,9 @@ def test_no_resolution_is_suggested_where_none_helps():
 def test_colliders_that_part_particles_are_accepted_with_a_warning():
     with pytest.warns(UserWarning, match=r"strike its edge .* set fidelity='medium'"):
         check("coarse", ("box", (0.01, 0.5, 0.5)))
+    for make in POLES.values():
+        with pytest.warns(UserWarning, match=r"strike it fast .* set fidelity='fine'"):
+            check("coarse", make(0.02))
     for pole in (("capsule", (0.025, 0.5)), ("sphere", (0.05,))):
         with pytest.warns(UserWarning, match=r"strike it fast .* set fidelity='medium'"):
             check("coarse", pole)
