@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from agents.ranks import Ranks  # which needs torch
 
-_NOTICE = b"\nending where the training can go on later, after this rollout; Ctrl-C again ends it at once\n"
+_NOTICE = b"\nstopping after this rollout, so that the run can be resumed; Ctrl-C again stops it at once\n"
 
 
 class StopRequest:

@@ -191,7 +191,7 @@ def check_options(options: Options) -> None:
     Raises:
         ConfigError: options that do not go together, no episodes, no pictures, or files that cannot be written.
         ImportError: the extra ``usd`` is not installed, for that format.
-        ValueError: a seed that there is not, what is no video by its name, or a folder that holds something.
+        ValueError: a seed that there is not, what is not a video by its name, or a folder that holds something.
     """
     if options.live and (options.out or options.film or options.export or options.episodes is not None):
         others = "--out, --film, --export and --episodes"

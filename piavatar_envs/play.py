@@ -120,7 +120,7 @@ def settings_of(device: str, overrides: Mapping[str, Any] | None) -> dict[str, A
         ValueError: the overrides set the render mode.
     """
     if "render_mode" in (overrides or {}):
-        raise ValueError("render_mode is no setting here; use play --video FILE for a film, or watch for the live view")
+        raise ValueError("render_mode is not a setting here; use play --video FILE for a film, watch for the live view")
     return {"device": device, **(overrides or {})}
 
 

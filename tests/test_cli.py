@@ -152,7 +152,7 @@ def test_video_has_a_frame_for_each_state(probe, tmp_path, suffix):
         (["play", PROBE, "--config", "tone"], "'tone' is not an override"),
         (["play", PROBE, "--fidelity", "tiny"], "use -c fidelity=tiny"),
         (["play", PROBE, "--control.tone=0"], "use -c control.tone=0"),
-        (["play", PROBE, "-c", "render_mode=human"], "render_mode is no setting"),
+        (["play", PROBE, "-c", "render_mode=human"], "render_mode is not a setting"),
     ],
 )
 def test_mistakes_end_in_one_line(probe, capsys, args, words):

@@ -20,7 +20,7 @@ pytest.importorskip("viser", reason='needs pip install "piavatar-envs[live]"')
         (["watch", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'"),
         (["watch", "PIAvatar/Reach-v0", "--seed", "-1"], "seed=-1 must be >= 0"),
         (["watch", "Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 "),
-        (["watch", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here"),
+        (["watch", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is not a setting here"),
         (["watch", "PIAvatar/Reach-v0", "--agent", "nobody"], "no agent 'nobody'; there are random, zero, clip:"),
         (["watch", "PIAvatar/Reach-v0", "--num-envs", "0"], "num_envs=0"),
         (["watch"], "give the ID of an environment"),

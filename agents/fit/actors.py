@@ -51,7 +51,7 @@ class _Script:
             for name, value in frame.actions.items():
                 if name not in host.action_names:
                     raise ConfigError(
-                        f"actor.keyframes.{index}.actions.{name} is no component of the action; there are "
+                        f"actor.keyframes.{index}.actions.{name} is not a component of the action; there are "
                         f"{', '.join(host.action_names)}"
                     )
                 self.actions[index + 1, :, :, host.action_names.index(name)] = value

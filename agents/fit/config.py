@@ -123,7 +123,7 @@ def load_fit(source: Mapping[str, Any] | str | Path, overrides: Mapping[str, Any
         owner, _, setting = name.partition(".") if section == "scorers" else name.rpartition(".")
         known = settings.get(section) or {}
         if not (owner and isinstance(known, Mapping) and (section == "scorers" or owner in known)):
-            raise ConfigError(f"{key} is no setting; there are {', '.join(known) or 'no'} {section}")
+            raise ConfigError(f"{key} is not a setting; there are {', '.join(known) or 'no'} {section}")
         settings[section] = {**known, owner: {**(known.get(owner) or {}), setting: overrides.pop(key)}}
     config = load_resolved(FitConfig, _env_class, settings, overrides)
     scorers = {}

@@ -123,7 +123,7 @@ def _find(config: BaseModel, name: str) -> tuple[Any, dict[str, float], bool]:
         near = difflib.get_close_matches(part, known, 1)
         hint = f"did you mean {'.'.join([*parts[:depth], near[0]])}?" if near else f"there are {', '.join(known)}"
         raise ConfigError(
-            f"parameters.{name} is no setting of {type(config).__name__}"
+            f"parameters.{name} is not a setting of {type(config).__name__}"
             + (f"; {hint}" if known else f": {above} has no parts; set it under env to what the trials begin from")
         )
     if isinstance(value, BaseModel):
@@ -131,7 +131,7 @@ def _find(config: BaseModel, name: str) -> tuple[Any, dict[str, float], bool]:
     kinds = _kinds(annotation)
     ranged = isinstance(value, tuple) and len(value) == 2
     if not kinds & {int, float, Any} or (isinstance(value, (tuple, list)) and not ranged) or isinstance(value, bool):
-        raise ConfigError(f"parameters.{name} is no number; a study varies numbers only")
+        raise ConfigError(f"parameters.{name} is not a number; a study varies numbers only")
     return annotation, _limits(annotation, metadata), ranged
 
 
@@ -189,7 +189,7 @@ class Space:
         """Resolve the parameters and check that the environment takes both ends of every range.
 
         Raises:
-            ConfigError: a name that is no numeric setting, or a bound that the environment refuses.
+            ConfigError: a name that is not a numeric setting, or a bound that the environment refuses.
         """
         self.task_class = load_task(config.env_id)
         self.base = load_config(self.task_class.Config, config.env)
@@ -260,7 +260,7 @@ class Space:
             density[:, index] = own / props.volume[index]
             if not ((density >= LEAST_DENSITY) & (density <= MOST_DENSITY)).all():
                 raise ConfigError(
-                    f"{axis.name}={own.tolist()} kg in {props.volume[index]:.3g} m^3 is no possible density"
+                    f"{axis.name}={own.tolist()} kg in {props.volume[index]:.3g} m^3 is not a possible density"
                 )
             props.density.assign(density)
 

@@ -94,7 +94,7 @@ class Study:
             about = self._study.user_attrs[ABOUT]
         except Exception as error:  # of SQLite, SQLAlchemy and Optuna, each with its own
             raise ConfigError(
-                f"{path} is no file of a study ({type(error).__name__}); write elsewhere with --out"
+                f"{path} is not a file of a study ({type(error).__name__}); write elsewhere with --out"
             ) from None
         if about != self._about:
             differing = [key for key in self._about if about.get(key) != self._about[key]]

@@ -100,7 +100,7 @@ class Design:
         """Refuse a design with numbers out of range or unknown joints.
 
         Raises:
-            ConfigError: a name that is no joint's, or a number out of range.
+            ConfigError: a name that is not a joint's, or a number out of range.
         """
         for field in fields(self):
             name, value = field.name, getattr(self, field.name)
@@ -147,7 +147,7 @@ class PIDAgent:
                 where it shows none the rest pose.
 
         Raises:
-            ConfigError: a design that is no controller.
+            ConfigError: a design that is not a controller.
             ValueError: joints that are not moved by torques.
         """
         design.check()

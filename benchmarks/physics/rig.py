@@ -226,7 +226,7 @@ class Rig:
     def strain(self) -> np.ndarray:
         """Return the mean distance of the deformation gradient to the nearest rotation, shape ``(num_envs,)``.
 
-        ``|F - R|`` rather than ``|F - I|``: a free body that is struck turns, and a turn is no strain.
+        ``|F - R|`` rather than ``|F - I|``: a free body that is struck turns, and a turn is not strain.
         """
         F = matrices_of(self.state.F).astype(float)
         squared = np.linalg.eigvalsh(np.swapaxes(F, 2, 3) @ F)

@@ -95,7 +95,7 @@ def check_task(
     terms = [term.name for term in monitored.terms()]
     for name in constant:
         if name not in terms:
-            raise ValueError(f"constant={name!r} is no term that the task observes; there are {', '.join(terms)}")
+            raise ValueError(f"constant={name!r} is not a term that the task observes; there are {', '.join(terms)}")
     monitor = WriteMonitor(monitored)
     many = EpisodeHost(monitored, NUM_ENVS, device, num_threads=1)
     one = EpisodeHost(task_class(settings), 1, device)

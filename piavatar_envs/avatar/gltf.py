@@ -187,7 +187,7 @@ class Gltf:
         if key not in self._lists:
             found = self.json.get(key, [])
             if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-                raise ValueError(f"{key} is no list of objects")
+                raise ValueError(f"{key} is not a list of objects")
             self._lists[key] = found
         return self._lists[key]
 
@@ -344,7 +344,7 @@ class Gltf:
             try:
                 return base64.b64decode(data, validate=True)
             except binascii.Error as error:
-                raise ValueError(f"{what} is no base64: {error}") from None
+                raise ValueError(f"{what} is not base64: {error}") from None
         folder = self.path.parent.resolve()
         file = (folder / urllib.parse.unquote(uri)).resolve()
         if "://" in uri or not file.is_relative_to(folder):
@@ -359,7 +359,7 @@ class Gltf:
         """Refuse a document that requires what is not read."""
         required = self.json.get("extensionsRequired", [])
         if not isinstance(required, list):
-            raise ValueError("extensionsRequired is no list")
+            raise ValueError("extensionsRequired is not a list")
         for name in required:
             if name in _COMPRESSED:
                 raise ValueError(f"it requires {name}, which is not read; {_COMPRESSED[name]}")
@@ -374,7 +374,7 @@ class Gltf:
         for index, node in enumerate(nodes):
             children = node.get("children", [])
             if not isinstance(children, list):
-                raise ValueError(f"children of node {index} are no list")
+                raise ValueError(f"children of node {index} are not a list")
             for child in children:
                 child = whole(child, f"child of node {index}", len(nodes) - 1)
                 if parents[child] >= 0:
@@ -424,7 +424,7 @@ class Gltf:
         if "matrix" in node:
             matrix = numbers(node["matrix"], 16, f"matrix {what}").reshape(4, 4).T
             if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0)):
-                raise ValueError(f"matrix {what} is no transform of points")
+                raise ValueError(f"matrix {what} is not a transform of points")
             self._fixed[index] = matrix
             self.translations[index] = matrix[:3, 3]
             self.scales[index] = np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
@@ -579,7 +579,7 @@ def read_gltf(path: str | Path) -> Gltf:
             raise ValueError(f"its JSON has {marks} brackets and commas, more than {MAX_JSON}")
         parsed = json.loads(document.decode("utf-8-sig"), parse_constant=_refuse)
         if not isinstance(parsed, dict):
-            raise ValueError("its JSON is no object")
+            raise ValueError("its JSON is not an object")
         return Gltf(path, parsed, binary)
 
 

@@ -259,7 +259,7 @@ class _Reader:
         if "indices" in primitive:
             corners = self.array(primitive["indices"], 1, f"indices of the {what}")[:, 0]
             if corners.dtype.kind not in "iu":
-                raise ValueError(f"indices of the {what} are no whole numbers")
+                raise ValueError(f"indices of the {what} are not whole numbers")
             corners = corners.astype(np.int64)
             if corners.min() < 0 or corners.max() >= count:
                 raise ValueError(

@@ -35,7 +35,7 @@ class ConfigError(ValueError):
 
 
 class UnexpectedKeyword(ConfigError, TypeError):
-    """A keyword of a call that is no setting; libraries that try their own keywords look for Python's TypeError."""
+    """A keyword of a call that is not a setting; libraries that try their own keywords look for Python's TypeError."""
 
     def __init__(self, *errors: object) -> None:
         # gym.make appends all arguments of the call to the message of a TypeError
@@ -204,15 +204,15 @@ def _unknown_key(cls: type[BaseModel], place: _Place, value: Any) -> str:
     key, names = place.key.removeprefix(place.entry), setting_keys(held)
     section, _, leaf = key.rpartition(".")
     if key in _ELSEWHERE and not place.entry:
-        return f"{key} is no setting of {held.__name__}; {_ELSEWHERE[key]}"
+        return f"{key} is not a setting of {held.__name__}; {_ELSEWHERE[key]}"
     leaves = {name.rpartition(".")[2]: name for name in reversed(names)}
     close = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.6)
     sections = [name for name in held.model_fields if name not in names and name != section]
     near = leaves[close[0]] if close else next(iter(difflib.get_close_matches(leaf, sections, n=1)), None)
     if near:
-        return f"{place.key} is no setting of {held.__name__}; did you mean {place.entry}{near}?"
+        return f"{place.key} is not a setting of {held.__name__}; did you mean {place.entry}{near}?"
     siblings = [name for name in names if name.startswith(f"{section}.")] if section else list(held.model_fields)
-    return f"{place.key} is no setting of {held.__name__}; there are {', '.join(siblings or names)}"
+    return f"{place.key} is not a setting of {held.__name__}; there are {', '.join(siblings or names)}"
 
 
 def _other_variant(place: _Place, value: Any) -> str | None:

@@ -116,7 +116,7 @@ def load_keywords(
 
     Raises:
         ConfigError: as :func:`load_config`.
-        UnexpectedKeyword: a keyword is no setting; its message has Python's words for that.
+        UnexpectedKeyword: a keyword is not a setting; its message has Python's words for that.
     """
     try:
         return load_config(cls, source, keywords)
@@ -267,7 +267,7 @@ def _expand(
         prefix: dotted name of the section that they are in, with a dot at its end.
 
     Raises:
-        ConfigError: a name is no string or has an empty part, or a setting is given twice.
+        ConfigError: a name is not a string or has an empty part, or a setting is given twice.
     """
     if isinstance(settings, BaseModel):
         return settings.model_dump(mode="json")
@@ -278,7 +278,7 @@ def _expand(
             raise ConfigError(f"{prefix}{key!r} is of type {type(key).__name__}; {_NAMES}")
         if "" in key.split("."):
             raise ConfigError(
-                f"{prefix}{key!r} is no name of a setting; write names without empty parts, as control.tone"
+                f"{prefix}{key!r} is not the name of a setting; write names without empty parts, as control.tone"
             )
         head, _, rest = (key if prefix else _qualified(models[0], key)).partition(".")
         field = next((model.model_fields[head] for model in models if head in model.model_fields), None)
@@ -407,7 +407,7 @@ def plain(value: Any, key: str = "") -> Any:
     """Return the JSON form of a value of a Python caller or of YAML, such as a NumPy array, a path or a model.
 
     Raises:
-        ConfigError: it has none, or a name is no string.
+        ConfigError: it has none, or a name is not a string.
     """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")

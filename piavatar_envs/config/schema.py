@@ -752,7 +752,7 @@ class RenderConfig(BaseModel):
         "(strain); |F - R|, with the rotation R of the deformation gradient F (distortion); or the impulse of other "
         "bodies on the body part in the last control step (impulse)",
     )
-    overlays: bool = Field(True, description="draw what is no matter: the task's markers, and the scale of colours")
+    overlays: bool = Field(True, description="draw what is not matter: the task's markers, and the scale of colours")
     mosaic: int | None = Field(
         None,
         ge=1,

@@ -59,7 +59,7 @@ def read_pickle(data: bytes) -> Any:
         code = stream.read(1)
         operation = pickletools.code2op.get(code.decode("latin-1"))
         if operation is None:
-            raise ValueError("the pickle ends early" if not code else f"{code!r} is no opcode of a pickle")
+            raise ValueError("the pickle ends early" if not code else f"{code!r} is not an opcode of a pickle")
         if operation.name == "STOP":
             return _pop(stack)
         _execute(operation.name, _argument(operation, stream), stack, memo)
@@ -120,7 +120,7 @@ def _execute(name: str, argument: Any, stack: list, memo: dict) -> None:
 
 def _named(name: str) -> type[Stub] | Stub:
     if not ADMITTED.fullmatch(name):
-        raise ValueError(f"the pickle asks for {name[:80]!r}, which is no array; nothing of it was run")
+        raise ValueError(f"the pickle asks for {name[:80]!r}, which is not an array; nothing of it was run")
     return Stub(name)
 
 
@@ -200,7 +200,7 @@ def _numpy_value(stub: Stub, depth: int) -> Any:
         return array_of(raw, _dtype(dtype), shape, order == "F")
     if kind == "scalar":
         return array_of(stub.arguments[1], _dtype(stub.arguments[0]), (), False)[()]
-    raise ValueError(f"{stub.name} is no value")
+    raise ValueError(f"{stub.name} is not a value")
 
 
 def array_of(raw: bytes | str, dtype: np.dtype, shape: Any, fortran: bool) -> np.ndarray:

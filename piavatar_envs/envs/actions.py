@@ -126,8 +126,8 @@ def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[st
         names: of the components, for messages.
 
     Raises:
-        ValueError: the action is no array of real numbers, has another shape, or is not finite; the message names the
-            component.
+        ValueError: the action is not an array of real numbers, has another shape, or is not finite; the message names
+            the component.
     """
     try:
         is_complex = np.iscomplexobj(action)

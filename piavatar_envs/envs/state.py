@@ -198,7 +198,7 @@ def _compare(saved: np.ndarray, own: np.ndarray) -> None:
     try:
         then = json.loads(saved.tobytes())
     except UNREADABLE:
-        raise ValueError(_unreadable("is no text of settings")) from None
+        raise ValueError(_unreadable("is not a text of settings")) from None
     unlike = _first_unlike(then, json.loads(own.tobytes()))
     if unlike:
         name, was, now = unlike

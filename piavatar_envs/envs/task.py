@@ -180,7 +180,7 @@ class Task:
         """Check the declarations and derive names and columns.
 
         Raises:
-            ValueError: a declaration of another type, or a name that is no name, is given twice or is taken.
+            ValueError: a declaration of another type, or a name that is not a name, is given twice or is taken.
         """
         super().__init_subclass__(**kwargs)
         cls.reward_names = cls._names("rewards", Term)
@@ -207,7 +207,7 @@ class Task:
         declared, where = getattr(cls, what), f"{cls.__name__}.{what}"
         example = f"{what} = ({kind.__name__}({'...' if kind is TaskArray else chr(34) + 'near' + chr(34) + ', ...'}),)"
         if not isinstance(declared, tuple) or not all(isinstance(one, kind) for one in declared):
-            raise ValueError(f"{where}={declared!r} is no tuple of {kind.__name__}; write {example}")
+            raise ValueError(f"{where}={declared!r} is not a tuple of {kind.__name__}; write {example}")
         names = tuple(one.name for one in declared)
         for index, name in enumerate(names):
             if not isinstance(name, str) or not name.isidentifier() or name.startswith("_") or iskeyword(name):

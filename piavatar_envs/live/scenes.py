@@ -69,7 +69,7 @@ class SavedScene:
         """Read the content of a file.
 
         Raises:
-            ValueError: it is no scene, or one of another version.
+            ValueError: it is not a scene, or one of another version.
         """
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as file:
@@ -81,7 +81,7 @@ class SavedScene:
             state = {name.removeprefix(_STATE): value for name, value in arrays.items()}
             scene = cls(**about, state=state)
         except (OSError, KeyError, TypeError, AttributeError, *UNREADABLE) as error:
-            raise ValueError(f"this is no scene of the live view ({type(error).__name__}: {error})") from None
+            raise ValueError(f"this is not a scene of the live view ({type(error).__name__}: {error})") from None
         if version != VERSION:
             raise ValueError(f"this scene has version {version}, and this package reads {VERSION}")
         return scene
@@ -92,7 +92,7 @@ def read_scene(path: Path) -> SavedScene:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no scene.
+        ValueError: it is not a scene.
     """
     try:
         return SavedScene.from_bytes(path.read_bytes())

@@ -153,7 +153,7 @@ def mesh(path: str | Path, spacing: float, scale: float = 1.0) -> PropPoints:
     Raises:
         ImportError: the optional package trimesh is missing.
         FileNotFoundError: there is no such file.
-        ValueError: the file is no closed mesh of a known format, or the solid is too thin for the spacing.
+        ValueError: the file is not a closed mesh of a known format, or the solid is too thin for the spacing.
     """
     path = Path(path)
     _check_lengths(path.name, spacing=spacing, scale=scale)

@@ -120,5 +120,5 @@ def test_a_resolved_configuration_is_whole_and_reads_back_equal(tiny, tmp_path):
     assert yaml.safe_load(path.read_text())["env"]["physics"]["density"] == 1000.0  # a default, said nevertheless
     again = load_training(path)
     assert again == tiny
-    # and a change of it is no setting given twice
+    # and a change of it is not a setting given twice
     assert env_config(load_training(path, {"env.fidelity": "coarse"})).physics.fidelity == "coarse"

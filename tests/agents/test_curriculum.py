@@ -68,7 +68,7 @@ def test_curricula_are_for_training_only(device, tmp_path, capsys):
     assert env.config.pose_noise == 0.3 and env.config.control.root_assist == 0.1
     assert config.env["pose_noise"] == 0.05 and config.env["control"]["root_assist"] == 0.0
     env.close()
-    with pytest.raises(SystemExit, match=r"tail is no setting of StandConfig"):
+    with pytest.raises(SystemExit, match=r"tail is not a setting of StandConfig"):
         rsl_ppo.main([*FEW, "curriculum={tail: 1}", "iterations=1", "--device", device, "--out", str(tmp_path)])
 
 

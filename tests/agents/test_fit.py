@@ -81,11 +81,11 @@ def test_names_reach_lists_ranges_and_whole_numbers():
         ({"physics.yung_modulus": {"low": 1, "high": 2}}, r"did you mean physics\.young_modulus"),
         (
             {"scene.props.1.mass": {"low": 1, "high": 2}},
-            r"parameters\.scene\.props\.1\.mass is no setting.*there are 0",
+            r"parameters\.scene\.props\.1\.mass is not a setting.*there are 0",
         ),
-        ({"physics.material": {"low": 1, "high": 2}}, "is no number"),
+        ({"physics.material": {"low": 1, "high": 2}}, "is not a number"),
         ({"physics": {"low": 1, "high": 2}}, "is a section"),
-        ({"scene.ground": {"low": 0, "high": 1}}, "is no number"),
+        ({"scene.ground": {"low": 0, "high": 1}}, "is not a number"),
         ({"physics.friction": {"low": 2, "high": 1}}, r"low=2 must be below high=1"),
         ({"physics.friction": {"low": 0, "high": 1, "scale": "log"}}, r"low=0 must be > 0"),
         ({"physics.poisson_ratio": {"low": 0.1, "high": 0.5}}, r"poisson_ratio=0\.5 must be < 0\.5"),
@@ -178,7 +178,7 @@ def test_scripts_act_from_their_times_on(device):
         player.close()
     assert np.array_equal(turned[0][:3], turned[1][:3]) and not np.array_equal(turned[0][3], turned[1][3])
     wrong = study(actor={"kind": "keyframes", "keyframes": [{"actions": {"left_elbw.x": 1.0}}]})
-    with pytest.raises(ConfigError, match=r"left_elbw\.x is no component"):
+    with pytest.raises(ConfigError, match=r"left_elbw\.x is not a component"):
         list(Player(wrong, Space(wrong), (), device=device).play([space.values([0.5])], [0]))
 
 
@@ -310,7 +310,7 @@ def test_a_file_of_other_settings_or_of_something_else_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"other settings \(seed\)"):
         Study(config.model_copy(update={"seed": 1}), Space(config), tmp_path)
     (tmp_path / FILE).write_bytes(b"no database")
-    with pytest.raises(ConfigError, match="no file of a study"):
+    with pytest.raises(ConfigError, match="not a file of a study"):
         Study(config, Space(config), tmp_path)
 
 

@@ -10,7 +10,7 @@ from agents.pid.controller import PID, Gains, PosePID, difference
 
 M, L, G = 2.0, 0.5, 9.81
 INERTIA, LOAD = M * L**2, M * G * L  # [kg m^2], [N m]
-AXIS = np.array([0.36, 0.48, 0.8])  # a pendulum that turns about an axis that is no joint's own
+AXIS = np.array([0.36, 0.48, 0.8])  # a pendulum that turns about an axis that is not a joint's own
 
 
 def swing(controller, angle, target, seconds, damping=0.0, upright=False, blocked=0.0, hold=1):

@@ -133,7 +133,7 @@ def test_the_command_line_trains_and_refuses(tiny, device, tmp_path, capsys):
     assert load_training(tmp_path / "run" / "config.yaml").total_steps == 32
     with pytest.raises(SystemExit) as refused:
         train.main([str(path), "ppo.epoch=3", "--out", str(tmp_path / "run")])
-    assert str(refused.value) == "error: ppo.epoch is no setting of TrainingConfig; did you mean ppo.epochs?"
+    assert str(refused.value) == "error: ppo.epoch is not a setting of TrainingConfig; did you mean ppo.epochs?"
 
 
 def test_the_demo_replaces_a_stopped_one_and_leaves_policy_film_and_scores(tmp_path, monkeypatch):

@@ -104,14 +104,14 @@ def test_clocks_can_be_set_and_end_the_episodes(env):
     """Set them as `init_at_random_ep_len` does: environments then end one after the other."""
     env.reset(seed=0)
     env.episode_length_buf = torch.tensor([STEPS - 2, STEPS + 7], device=env.device)
-    assert env.episode_length_buf.tolist() == [STEPS - 2, STEPS - 1], "a clock that has run out is no start"
+    assert env.episode_length_buf.tolist() == [STEPS - 2, STEPS - 1], "a clock that has run out is not a start"
     still = torch.zeros(2, env.num_actions, device=env.device)
     done = [env.step(still)[2].tolist() for _ in range(2)]
     assert done == [[0, 1], [1, 0]] and env.episode_length_buf.tolist() == [0, 1]
     assert env.episode_length_buf.dtype == torch.int64
     with pytest.raises(ValueError, match=r"shape \(3,\), expected \(2,\)"):
         env.episode_length_buf = torch.zeros(3)
-    for length in (torch.nan, 0.5):  # one that is no number would never end
+    for length in (torch.nan, 0.5):  # one that is not a number would never end
         with pytest.raises(ValueError, match="whole numbers"):
             env.episode_length_buf = torch.tensor([length, 1.0])
 

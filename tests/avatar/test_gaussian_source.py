@@ -213,7 +213,7 @@ def test_what_does_not_fit_is_refused(person, tmp_path, monkeypatch):
     for name, given, message in (
         ("few.ply", {}, "50 splats are more opaque than 0.5"),
         ("big.ply", {}, "give its height in metres"),
-        ("a.ply", {"up": "w"}, "up='w' is no axis.*z, y, x, -z, -y, -x"),
+        ("a.ply", {"up": "w"}, "up='w' is not an axis.*z, y, x, -z, -y, -x"),
         ("a.ply", {"pose": "B"}, "pose='B' is none of A, T and no .json"),
         ("a.ply", {"height": 9.0}, r"height=9 is outside \[0.3, 3\]"),
         ("a.ply", {"body": {"source": "no"}}, "unknown avatar source 'no'"),

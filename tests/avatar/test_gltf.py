@@ -261,7 +261,7 @@ def chain(count: int) -> list[dict]:
         ({"nodes": [{"children": [7]}]}, "child of node 0"),
         ({"nodes": [{"rotation": [0, 0, 0, 0]}]}, "norm"),
         ({"nodes": [{"scale": "big"}]}, "scale"),
-        ({"nodes": 7}, "no list"),
+        ({"nodes": 7}, "not a list"),
         ({"nodes": [{"mesh": 0.5}]}, "index of meshes"),
         ({"nodes": [{"mesh": -1}]}, "index of meshes"),
         ({"accessors": [{"componentType": 5126, "type": "VEC3", "count": 2**32 - 1}]}, "count"),

@@ -88,7 +88,7 @@ def test_a_surface_that_the_body_does_not_fit_to_is_refused(file, monkeypatch):
     monkeypatch.setattr(mesh, "_registered", lambda *_: bad)
     with pytest.raises(ValueError, match=r"person.ply: the body does not fit.* 6\.\d cm away.*A- or T-pose.*, -x\)"):
         mesh.read_character(str(file))
-    with pytest.raises(ValueError, match=r"up='w' is no axis.*z, y, x, -z, -y, -x"):
+    with pytest.raises(ValueError, match=r"up='w' is not an axis.*z, y, x, -z, -y, -x"):
         mesh.read_character(str(file), up="w")
 
 

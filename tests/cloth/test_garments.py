@@ -185,7 +185,7 @@ def test_files_that_are_no_garment_are_refused(tmp_path, wearers):
         ("skirt", {"flare": 3.0}, r"flare=3.0 of the garment 'skirt' must be less than or equal to 1 \[-\]"),
         ("skirt", {"length": 9.0}, r"length=9.0 .* must be less than or equal to 1.5 \[m\]"),
         ("skirt", {"length": "long"}, "length='long' .* must be a valid number"),
-        ("skirt", {"sleeve": 1.0}, "sleeve=1.0 is no setting of the garment 'skirt'; it has length, flare"),
+        ("skirt", {"sleeve": 1.0}, "sleeve=1.0 is not a setting of the garment 'skirt'; it has length, flare"),
         ("trousers", {"length": 2.5}, "length=2.5"),
         ("mesh", {}, "path is missing"),
         ("mesh", {"path": "a.obj", "held": "hem"}, "held='hem' .* 'top' or 'none'"),
@@ -218,7 +218,7 @@ def test_a_kind_of_ones_own_is_one_function(monkeypatch, wearers):
     register_garment("patch", patch)
     assert "patch" in list_garments()
     assert np.ptp(cut_garment("patch", wearers["mean"], {"size": 0.1}).positions[:, 0]) == pytest.approx(0.1)
-    with pytest.raises(ValueError, match="colour='red' is no setting of the garment 'patch'; it has size"):
+    with pytest.raises(ValueError, match="colour='red' is not a setting of the garment 'patch'; it has size"):
         check_settings("patch", {"colour": "red"})
     with pytest.raises(ValueError, match="'skirt' is one of this package"):
         register_garment("skirt", patch)

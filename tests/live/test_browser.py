@@ -153,6 +153,13 @@ def tracked(show: Show, name: str) -> np.ndarray:
     return target.frame.position.numpy()[own, target.column].astype(float)
 
 
+def still(page: Page, show: Show, name: str) -> bool:
+    """Return whether a bone moves by less than a millimetre in five control steps."""
+    before, done = tracked(show, name), steps_done(show)
+    page.until(lambda: not done <= steps_done(show) <= done + 5)  # a new episode counts from 0
+    return bool(np.linalg.norm(tracked(show, name) - before) < 1e-3)
+
+
 def test_play(page, show):
     page.press("Pause")
     page.until(lambda: not show.playing)
@@ -211,6 +218,7 @@ def test_drag(page, show):
     page.until(lambda: show.live.view.pointer == "drag")
     mouse = page.page.mouse
     for name in ("left_wrist", "pelvis"):
+        page.until(lambda name=name: still(page, show, name))  # else the body may swing away before the button is down
         x, y = page.pixel(tracked(show, name))
         before = tracked(show, name)
         mouse.move(x, y)

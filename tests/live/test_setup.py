@@ -41,5 +41,5 @@ def test_files_of_scenes_are_checked():
     np.testing.assert_array_equal(read.state["particles.x"], state["particles.x"])
     wrong = SavedScene(Setup("PIAvatar/Reach-v0", agent=3), {}, 0, "skin", 7, 1.5, state)
     for content in (b"", scene.to_bytes()[:-30], wrong.to_bytes()):
-        with pytest.raises(ValueError, match="no scene of the live view"):
+        with pytest.raises(ValueError, match="not a scene of the live view"):
             SavedScene.from_bytes(content)

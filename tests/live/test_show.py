@@ -295,7 +295,7 @@ def test_a_file_that_is_no_scene_is_named(open_show):
     show = open_show()
     host = show.host
     change(show, "open", SimpleNamespace(name="scene.npz", content=b"nothing"))
-    assert "no scene" in show.words and show.host is host and steps_done(show) == 1
+    assert "not a scene" in show.words and show.host is host and steps_done(show) == 1
 
 
 def test_games_are_watched(open_show):

@@ -161,7 +161,7 @@ def play(
 
 
 def test_a_ball_is_thrown_when_due_caught_beyond_the_radius_and_else_left_alone(make_env, device):
-    """Its turn wins over catching; what lies far out, or comes back, is no ball that flies on."""
+    """Its turn wins over catching; what lies far out, or comes back, is not a ball that flies on."""
     env = make_env(DODGE)
     env.reset(seed=0)
     out, still_there = [0.0, 1.2 * catching_distance(env.config), 0.5], [0.0, 0.0, 0.0]

@@ -36,7 +36,7 @@ UNIFORM = [2, 3, 2, 2, 2, 1, 1, 1]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A folder with clips of half a second and of a second, and files that are no motions."""
+    """A folder with clips of half a second and of a second, and files that are not motions."""
     folder = tmp_path_factory.mktemp("motions")
     rest = load_asset().joints.astype(np.float64)
     for name, clip, frames in (("short", "kick", 16), ("below/long", "arm_wave", 31)):

@@ -162,7 +162,7 @@ class MeasuredScorer:
         """Return the greatest root mean square angle of all joints from the pose at the reset [rad]."""
         local = episode.readings["bone_local_rotation"].astype(np.float64)
         cosine = np.abs((local * local[:1]).sum(axis=-1)).clip(0.0, 1.0)
-        angle = 2.0 * np.arccos(cosine)[:, 1:]  # the root is no joint
+        angle = 2.0 * np.arccos(cosine)[:, 1:]  # the root is not a joint
         return float(np.sqrt((angle**2).mean(axis=1)).max())
 
     def jiggle_frequency(self, episode: Episode) -> float:

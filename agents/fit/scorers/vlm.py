@@ -64,7 +64,7 @@ def check_model(path: Path | None) -> Path:
     """Return the folder of a model.
 
     Raises:
-        ConfigError: it is not given, or is no model that is read without running or unpickling anything.
+        ConfigError: it is not given, or is not a model that is read without running or unpickling anything.
     """
     if path is None:
         raise ConfigError(f"scorers.vlm.path is missing; fetch a model and give its folder: {_FETCH} FOLDER")

@@ -122,7 +122,7 @@ class SurfacePoints:
 
 @dataclass(frozen=True, eq=False)
 class WornSurface:
-    """A surface of a character's file that is no body, such as a skirt; a garment can be made of it.
+    """A surface of a character's file that is not a body, such as a skirt; a garment can be made of it.
 
     Attributes:
         vertices: in the reference pose of the mean shape [m], shape ``(W, 3)`` float32.

@@ -338,7 +338,7 @@ def _coarser(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple
 
 
 def _check(character: Character) -> None:
-    """Refuse arrays that do not fit together, and a body that is no person's size.
+    """Refuse arrays that do not fit together, and a body that is not a person's size.
 
     Raises:
         ValueError: arrays do not fit together, or no person has that size.

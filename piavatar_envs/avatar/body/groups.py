@@ -48,7 +48,7 @@ def read_groups(path: str | Path, count: int) -> dict[str, np.ndarray]:
     with reading(path, 'groups of vertices (JSON such as {"head": [0, 1, 2]})'):
         content = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(content, dict):
-            raise ValueError("it is no object")
+            raise ValueError("it is not an object")
         if len(content) > MOST_GROUPS:
             raise ValueError(f"it has {len(content)} groups, more than {MOST_GROUPS}")
         groups = {}

@@ -129,7 +129,7 @@ def read_mapping(path: str | Path) -> dict[str, str]:
     with reading(path, 'a mapping of joints (JSON such as {"left_elbow": "LowerArm.L"})'):
         content = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(content, dict) or not all(isinstance(name, str) for name in content.values()):
-            raise ValueError("it is no object of names")
+            raise ValueError("it is not an object of names")
     return content
 
 
@@ -143,7 +143,7 @@ def map_joints(
     """Find our joints among the nodes of a rig.
 
     Args:
-        names: of the ``N`` nodes; an empty one is no candidate.
+        names: of the ``N`` nodes; an empty one is not a candidate.
         parents: node that each hangs on, -1 for a root; without cycles, in any order.
         positions: of the nodes at rest, in any axes and unit, shape ``(N, 3)``.
         humanoid: VRM's map from its bones to nodes, which names go after.

@@ -61,7 +61,7 @@ def read_splats(path: str | Path) -> SplatCloud:
     path = Path(path)
     readers = {".ply": _read_ply, ".spz": _read_spz, ".glb": _read_gltf, ".gltf": _read_gltf}
     if path.suffix.lower() not in readers:
-        raise ValueError(f"{path} is no file of splats by its ending; use one of {', '.join(SUFFIXES)}")
+        raise ValueError(f"{path} is not a file of splats by its ending; use one of {', '.join(SUFFIXES)}")
     check_file(path)
     with reading(path, "a file of Gaussian splats"):
         return readers[path.suffix.lower()](path)
@@ -194,7 +194,7 @@ def _check_properties(vertex: _Element) -> None:
     for name in (*names, *(f"f_rest_{i}" for i in range(rest))):
         if name not in vertex.types:
             raise ValueError(
-                f"its vertices have no property {name}, so they are no splats of 3DGS; for a surface use the source "
+                f"its vertices have no property {name}, so they are not splats of 3DGS; for a surface use the source "
                 "mesh"
             )
         if vertex.types[name][0] != "f":

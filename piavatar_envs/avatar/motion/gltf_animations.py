@@ -27,7 +27,7 @@ def names_of_animations(path: str | Path) -> tuple[str, ...]:
     """Return the names by which :func:`read_animation` finds the animations of a file: their own, or their places.
 
     Raises:
-        ValueError: it is no glTF file.
+        ValueError: it is not a glTF file.
         FileNotFoundError: there is no such file.
     """
     names = [animation.name for animation in read_gltf(path).animations]

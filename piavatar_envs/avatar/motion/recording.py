@@ -120,7 +120,7 @@ def to_motion(recording: Recording, rest_joints: np.ndarray, mapping: Mapping[st
     stands = is_standing(joint_map, recording.zero)
     if not stands:
         recording = recording.since(most_upright(recording, joint_map, rest_joints))
-        notes.append("the skeleton's zero pose is no standing figure: the frame most like one is taken")
+        notes.append("the skeleton's zero pose is not a standing figure: the frame most like one is taken")
     if axes_of(joint_map, recording.zero)[1]:
         recording = recording.mirrored()
         notes.append("the file is left-handed: mirrored")
@@ -130,7 +130,7 @@ def to_motion(recording: Recording, rest_joints: np.ndarray, mapping: Mapping[st
     zero = joints_of(joint_map, recording.zero) @ axes.T
     leg = leg_length(zero)
     if not 0.0 < leg < np.inf:
-        raise ValueError(f"{recording.source}: legs of length {leg:g} in its zero pose; it is no figure")
+        raise ValueError(f"{recording.source}: legs of length {leg:g} in its zero pose; it is not a figure")
     directions: dict[str, np.ndarray | None] = {
         start: zero[joint_index(end)] - zero[joint_index(start)] for start, end in LIMB_ENDS.items()
     }

@@ -36,7 +36,7 @@ MOST_STOPS = wp.constant(8)
 
 
 class PoseBoneContact:
-    """Contact of the bones of one avatar under pose control with colliders that are no planes.
+    """Contact of the bones of one avatar under pose control with colliders that are not planes.
 
     Attributes:
         used: whether there are such colliders; otherwise nothing is recorded.

@@ -80,7 +80,7 @@ def check_settings(kind: str, settings: Mapping[str, Any]) -> None:
     unknown = [name for name in settings if name not in own]
     if unknown and inspect.Parameter.VAR_KEYWORD not in kinds:
         there = f"it has {', '.join(own)}" if own else "it has no settings"
-        raise ValueError(f"{unknown[0]}={settings[unknown[0]]!r} is no setting of the garment {kind!r}; {there}")
+        raise ValueError(f"{unknown[0]}={settings[unknown[0]]!r} is not a setting of the garment {kind!r}; {there}")
     for name, parameter in own.items():
         if parameter.default is inspect.Parameter.empty and name not in settings:
             raise ValueError(f"{name} is missing: the garment {kind!r} needs it")

@@ -34,7 +34,7 @@ def cut(
         edge: of the mesh.
 
     Raises:
-        ValueError: the wearer's file has no such surface, or it is no single sheet.
+        ValueError: the wearer's file has no such surface, or it is not a single sheet.
     """
     name, own = _surface(wearer, surface)
     points = _placed(wearer, own.vertices.astype(np.float64))

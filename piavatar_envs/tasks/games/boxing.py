@@ -142,7 +142,7 @@ def count_points(
         points[e, agent, other] = gain
         score[e, agent] = score[e, agent] + gain
         impulse[e, agent, other] = now
-        # a contact that lasts is no new blow
+        # a contact that lasts is not a new blow
         for target in range(2):
             if now[target] < RELEASE * rules.blow_impulse:
                 most[target] = 0.0

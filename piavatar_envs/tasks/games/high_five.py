@@ -113,7 +113,7 @@ def judge(
     distance = wp.length(hands.middle[e, 0] - hands.middle[e, 1])
     height = wp.min(hands.middle[e, 0][2], hands.middle[e, 1][2])
     upright = wp.min(hands.direction[e, 0][2], hands.direction[e, 1][2])
-    # an impulse on only one of the two arms is no slap
+    # an impulse on only one of the two arms is not a slap
     impulse = wp.min(arm_impulse(sensors, e, 0, side[e]), arm_impulse(sensors, e, 1, side[e]))
     placed = distance <= rule.reach and height >= rule.least_height and upright >= rule.upright
     too_hard = impulse > rule.impulse_window * least[e]

@@ -49,7 +49,7 @@ def build(
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, its rig lacks a joint, or its height is no person's.
+        ValueError: it cannot be read, its rig lacks a joint, or its height is not a person's.
     """
     character = read_character(path, height, mapping)
     return with_skeleton(body_of(character), character, skeleton)
@@ -65,7 +65,7 @@ def read_character(path: str | Path, height: float | None = None, mapping: str |
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, its rig lacks a joint, or its height is no person's.
+        ValueError: it cannot be read, its rig lacks a joint, or its height is not a person's.
     """
     gltf = read_gltf(path)
     surfaces = read_surfaces(gltf)
@@ -143,7 +143,7 @@ def scale_of(size: float, height: float | None, path: str) -> tuple[float, list[
         path: for the error.
 
     Raises:
-        ValueError: the character has no height, or one that is no person's.
+        ValueError: the character has no height, or one that is not a person's.
     """
     if not (np.isfinite(size) and size > 0.0):
         raise ValueError(f"{path}: the character is {size:g} tall")
@@ -164,7 +164,7 @@ def scale_of(size: float, height: float | None, path: str) -> tuple[float, list[
 
 
 def _rig(gltf: Gltf, rest: np.ndarray, mapping: str | Path | None) -> JointMap:
-    """Return our joints among the nodes of a file; its meshes are no candidates, though they be named as joints.
+    """Return our joints among the nodes of a file; its meshes are not candidates, though they be named as joints.
 
     Args:
         gltf: the file.

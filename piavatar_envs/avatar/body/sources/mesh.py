@@ -212,13 +212,13 @@ class _Beside:
 
 
 def check_up(up: str | None) -> None:
-    """Refuse what is no axis that points up.
+    """Refuse what is not an axis that points up.
 
     Raises:
         ValueError: it is not one of :data:`UPS`.
     """
     if up is not None and up not in UPS:
-        raise ValueError(f"up={up!r} is no axis that points up; use one of {', '.join(UPS)}")
+        raise ValueError(f"up={up!r} is not an axis that points up; use one of {', '.join(UPS)}")
 
 
 def nearest_fit(fit: Callable[[str], _Fit], usual: Sequence[str], size: np.ndarray, most: float) -> _Fit:

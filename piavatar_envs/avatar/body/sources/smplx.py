@@ -132,7 +132,7 @@ def _coefficients(name: str, values: Sequence[float], most: int) -> np.ndarray:
     if len(coefficients) > most:
         raise ValueError(f"{name} has {len(coefficients)} coefficients, the file {most}; leave the last ones out")
     if not (np.abs(coefficients) <= 10.0).all():
-        raise ValueError(f"{name} has a value that is no number within 10 standard deviations: {coefficients.tolist()}")
+        raise ValueError(f"{name} has a value that is not within 10 standard deviations: {coefficients.tolist()}")
     return coefficients
 
 
