@@ -46,7 +46,7 @@ class Options(runner.Options):
     #: diameters of hard balls [m]
     spheres: tuple[float, ...] = (0.062, 0.083, 0.125)
     #: what is struck
-    kinds: tuple[str, ...] = ("face", "edge", "pole", "sphere")
+    kinds: tuple[str, ...] = ("face", "edge", "pole", "upright", "sphere")
     #: Young's moduli of the ball [Pa]; its waves at the second are as fast as the flesh's
     moduli: tuple[float, ...] = (1.0e4, 2.7e4, 1.0e5)
     #: speeds of the ball [m/s]
@@ -62,9 +62,11 @@ class Options(runner.Options):
 def solid(kind: str, thickness: float) -> Collider:
     """Return a collider about the origin that a ball strikes along x.
 
-    It is the ``"face"`` or ``"edge"`` of a plate, a ``"pole"`` along y, or a ``"sphere"``.
+    It is the ``"face"`` or ``"edge"`` of a plate, a level ``"pole"`` along y, an ``"upright"`` one, or a ``"sphere"``.
     """
     half = 0.5 * thickness
+    if kind == "upright":
+        return Collider("capsule", (half, HALF), friction=0.5)
     if kind == "sphere":
         return Collider("sphere", (half,), friction=0.5)
     if kind == "pole":
@@ -78,6 +80,7 @@ class Throw:
     Attributes:
         matter: the balls and the collider.
         front: where the collider begins along x [m].
+        across: axis along which the two sides of the collider lie.
         centers: centres of the balls from the collider's after every step [m], ``(steps, places, 3)``.
         distances: their distances from the collider [m], ``(steps, places)``.
     """
@@ -105,7 +108,7 @@ class Throw:
         boundaries = self.matter.model.boundaries
         self._shift = rng.uniform(0.0, dx, (count, 3))
         boundaries.position.assign(self._shift[:, None].astype(np.float32))
-        self.front = -(collider.size[0])
+        self.front, self.across = -collider.size[0], 1 if kind == "upright" else 2
         start = self._shift + rng.uniform(-ASIDE, ASIDE, (count, 3)) * (0.0, 1.0, 1.0)
         start[:, 0] += self.front - RADIUS - AHEAD
         turned = np.stack([turn.apply(points.rest) for turn in Rotation.random(count, random_state=0)])
@@ -135,7 +138,7 @@ class Throw:
         """Whether each ball hangs with the collider in it, shape ``(places,)``."""
         still = np.ptp(self.centers[-RATE // 3 :], axis=0).max(axis=1) < STILL
         beyond = self.x[..., 0] > self.front
-        sides = [(beyond & (sign * self.x[..., 2] > 0.0)).mean(axis=1) for sign in (-1.0, 1.0)]
+        sides = [(beyond & (sign * self.x[..., self.across] > 0.0)).mean(axis=1) for sign in (-1.0, 1.0)]
         return still & (np.minimum(*sides) > BOTH_SIDES) & (self.distances[-1] < 0.75 * RADIUS)
 
     @property
@@ -153,7 +156,8 @@ class Throw:
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Yield a row for each collider, modulus and speed."""
-    sizes = {"face": options.plates, "edge": options.plates, "pole": options.poles, "sphere": options.spheres}
+    sizes = {"face": options.plates, "edge": options.plates, "sphere": options.spheres}
+    sizes |= {"pole": options.poles, "upright": options.poles}
     for kind in options.kinds:
         for thickness, modulus, speed in itertools.product(sizes[kind], options.moduli, options.speeds):
             throw = Throw(options, kind, thickness, modulus, speed).run(options.seconds)
