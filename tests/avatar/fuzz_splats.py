@@ -23,7 +23,7 @@ from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.body.splat_files import read_splats, write_ply
 from piavatar_envs.avatar.body.splats import SplatCloud
 from scripts.gltf_files import Y_UP, Writer
-from tests.avatar.splat_clouds import on_body
+from scripts.synthetic_splats import on_body
 
 #: Memory beyond four times the file that a message, or the header of an archive, may take [bytes].
 SPARE_BYTES = 500_000

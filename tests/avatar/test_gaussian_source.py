@@ -19,8 +19,8 @@ from piavatar_envs.avatar.body.splat_registration import FittedBody
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.inspection import examine
 from piavatar_envs.tasks import load_task
+from scripts.synthetic_splats import on_body
 from tests.avatar.characters import in_t_pose
-from tests.avatar.splat_clouds import on_body
 
 COUNT = 3000
 #: Rows: x, y, z of a file in which y points down, in our axes.

@@ -15,8 +15,8 @@ from piavatar_envs.avatar.body.splat_files import read_splats, write_ply
 from piavatar_envs.avatar.body.splats import SplatCloud, harmonics, turned_colors
 from piavatar_envs.core.extras import MissingExtra
 from scripts.gltf_files import Y_UP
+from scripts.synthetic_splats import on_body
 from tests.avatar.fuzz_splats import SPARE_BYTES, fuzz, gltf_of, ply, with_rows
-from tests.avatar.splat_clouds import on_body
 
 FIELDS = ("means", "rotations", "scales", "opacities", "sh")
 

@@ -20,7 +20,7 @@ from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.render import Arrow, Body, Camera, MovedSplats, Scene, Sphere
 from piavatar_envs.render.coloring import NUM_BANDS, bands_of, color_by
 from piavatar_envs.render.live import LiveView, _fitter
-from tests.avatar.splat_clouds import on_body
+from scripts.synthetic_splats import on_body
 
 GREEN = (0.0, 1.0, 0.0)
 

@@ -21,7 +21,7 @@ from piavatar_envs.render.splat_motion import STRETCH, BoundSplats, record_turns
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.render.views import Shot, view_rows
-from tests.avatar.splat_clouds import drawn_as, on_body
+from scripts.synthetic_splats import drawn_as, on_body
 
 
 class Puppet:

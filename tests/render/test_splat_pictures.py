@@ -21,7 +21,7 @@ from piavatar_envs.render.scene import Camera
 from piavatar_envs.render.stage import Stage
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.render.views import Shot
-from tests.avatar.splat_clouds import drawn_as, on_body
+from scripts.synthetic_splats import drawn_as, on_body
 from tests.render.batches import act
 
 SPLATS = {"avatar.source": "body_of_splats"}

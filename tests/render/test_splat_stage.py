@@ -15,7 +15,7 @@ from piavatar_envs.export import Recording
 from piavatar_envs.render.painter import Painter
 from piavatar_envs.render.stage import Stage, bytes_of_stage
 from piavatar_envs.render.views import Shot, view_rows
-from tests.avatar.splat_clouds import drawn_as, on_body
+from scripts.synthetic_splats import drawn_as, on_body
 from tests.render.batches import act
 
 COUNT = 700

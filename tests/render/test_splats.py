@@ -21,7 +21,7 @@ from piavatar_envs.render.painter import Painter
 from piavatar_envs.render.splats import SplatPainter
 from piavatar_envs.render.surfaces import MeshPart, Surfaces
 from piavatar_envs.render.views import Shot, View, view_rows
-from tests.avatar.splat_clouds import on_body
+from scripts.synthetic_splats import on_body
 
 HEIGHT, WIDTH, FOCAL = 44, 52, 60.0
 SH0 = 0.28209479177387814

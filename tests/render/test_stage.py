@@ -17,7 +17,7 @@ from piavatar_envs.render.scene import Ring, Sphere
 from piavatar_envs.render.stage import MARKERS, Stage
 from piavatar_envs.sim.markers import MarkerSpec, turn_to
 from piavatar_envs.tasks.games import load_game_task
-from tests.avatar.splat_clouds import drawn_as, on_body
+from scripts.synthetic_splats import drawn_as, on_body
 from tests.render.batches import act, seen
 
 KICK = "PIAvatar/KickBall-v0"

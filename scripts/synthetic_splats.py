@@ -1,14 +1,23 @@
-"""Synthetic Gaussian avatars: splats on the skin of a body, in shirt and trousers."""
+"""Write a person of Gaussian splats: flat ones on the skin of the embedded body, in shirt and trousers.
+
+It serves tests, benchmarks and a first try without a capture::
+
+    python -m scripts.synthetic_splats person.ply --count 60000
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
+import tyro
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, area_vectors, dense_weights, top_weights
 from piavatar_envs.avatar.body.sampling import ClosedSurface
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.body.splat_files import write_ply
 from piavatar_envs.avatar.body.splats import COEFFICIENTS, SkinnedSplats, SplatCloud, constant_colors
 
 _SKIN, _SHIRT, _STRIPE, _TROUSERS = (0.85, 0.65, 0.55), (0.75, 0.15, 0.2), (0.92, 0.9, 0.85), (0.18, 0.25, 0.45)
@@ -73,3 +82,19 @@ def _colors(rest: np.ndarray) -> np.ndarray:
     colors[shirt] = np.where(np.floor(height[shirt] / 0.05)[:, None] % 2 == 0, _SHIRT, _STRIPE)
     colors[legs & (np.abs(rest[:, 0]) < 0.28)] = _TROUSERS
     return np.clip(colors, 0.02, 0.98)
+
+
+def main(path: tyro.conf.Positional[Path], count: int = 60_000, degree: int = 1) -> None:
+    """Write splats.
+
+    Args:
+        path: a .ply file.
+        count: number of splats.
+        degree: of the spherical harmonics, 0 to 3.
+    """
+    write_ply(path, on_body(load_asset(), count, degree))
+    print(f"{path}: {count} splats on the embedded body")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
