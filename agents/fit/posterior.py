@@ -197,6 +197,10 @@ class ResidualPosterior:
         count = min(COMPONENTS, 1 + int(np.searchsorted(share, EXPLAINED)))
         self._offsets = right[:count] @ center
         self.components = [Posterior(x, left[:, k] * sizes[k], seed, starts) for k in range(count)]
+        # residuals that no parameter changes are errors of the recording; independent ones of the same sizes move the
+        # match by that much along each component
+        unexplained = center - self._offsets @ right[:count]
+        self._recording_noise = np.sqrt(right[:count] ** 2 @ unexplained**2)
 
     @classmethod
     def near_match(
@@ -230,12 +234,13 @@ class ResidualPosterior:
     def draw(self, x: np.ndarray, count: int, seed: int) -> np.ndarray:
         """Draw functions of the sum of squares at places ``(m, d)``, shape ``(count, m)``.
 
-        What is matched differs from the smooth functions as any trial does, so each draw has an offset like the noise.
+        What is matched differs from the smooth functions as any trial does, and has the errors of the recording, so
+        each draw has an offset like both.
         """
         total = np.zeros((count, len(x)))
         rng = np.random.default_rng((seed, 1))
         for index, (offset, component) in enumerate(zip(self._offsets, self.components, strict=True)):
-            rough = rng.normal(0.0, component.noise, (count, 1))
+            rough = rng.normal(0.0, np.hypot(component.noise, self._recording_noise[index]), (count, 1))
             total += (offset + rough + component.draw(x, count, seed + index)) ** 2
         return total
 

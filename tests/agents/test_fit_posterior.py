@@ -78,3 +78,21 @@ def test_residuals_find_a_match_that_distances_miss():
     noisy = np.repeat(residuals, 200, axis=1) / np.sqrt(200.0)
     noisy = noisy + np.random.default_rng(0).normal(0.0, 0.1, noisy.shape[1]) / np.sqrt(200.0)
     assert np.abs(ResidualPosterior(x, noisy).best()[0] - place).max() < 0.05
+
+
+def test_intervals_of_a_match_hold_with_a_noisy_recording(monkeypatch):
+    # residuals of one parameter, and noise of the recording as large as what a third of the range changes
+    monkeypatch.setattr("agents.fit.posterior.POINTS", 64)  # enough for one parameter
+    x, count = qmc.Sobol(1, seed=2).random(16), 20
+    inside, widths = 0, []
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        place = rng.uniform(0.25, 0.75)
+        curve = np.repeat(np.stack([np.sin(2.0 * (x[:, 0] - place)), np.expm1(x[:, 0] - place)], 1), 50, axis=1)
+        residuals = curve + rng.normal(0.0, 0.5, curve.shape[1])
+        _, low, high = ResidualPosterior(x, residuals, seed, starts=1).best(seed)
+        inside += bool(low[0] <= place <= high[0])
+        widths.append(high[0] - low[0])
+    assert inside >= 0.8 * count
+    # least squares: 50 values each of slopes 2 and 1, with noise of 0.5
+    assert np.mean(widths) == pytest.approx(2.0 * 1.96 * 0.5 / np.sqrt(50 * (2.0**2 + 1.0)), rel=0.2)
