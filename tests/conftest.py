@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -103,6 +105,18 @@ def restored_registries() -> Iterator[None]:
             registered = sys.modules[name]._registered
             registered.clear()
             registered.update(before.get(name, {}))
+
+
+@contextmanager
+def in_core_seconds(most: float) -> Iterator[None]:
+    """Check that the body takes less time of a core than ``most`` [s], whatever other tests hold in memory."""
+    gc.freeze()  # collections of garbage would walk through it all
+    begin = time.process_time()
+    try:
+        yield
+        assert time.process_time() - begin < most
+    finally:
+        gc.unfreeze()
 
 
 @pytest.fixture

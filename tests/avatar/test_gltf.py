@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import struct
-import time
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.avatar.gltf_surfaces import read_surfaces
 from scripts.gltf_files import Writer, glb
+from tests.conftest import in_core_seconds
 
 
 @pytest.fixture
@@ -240,10 +240,9 @@ def test_required_extensions_that_are_not_read_are_refused(extension, remedy, fi
 def test_foreign_and_damaged_files_are_refused_in_one_line(name, content, message, tmp_path):
     path = tmp_path / name
     path.write_bytes(content)
-    begin = time.process_time()
-    with pytest.raises(ValueError, match=message) as caught:
+    with in_core_seconds(1.0), pytest.raises(ValueError, match=message) as caught:
         read_gltf(path)
-    assert time.process_time() - begin < 1.0 and "\n" not in str(caught.value) and str(path) in str(caught.value)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
 def chain(count: int) -> list[dict]:
@@ -291,10 +290,9 @@ def test_hostile_documents_are_refused_in_a_second(change, message, file):
     out.save(file)
     out.document["buffers"] = [{"byteLength": len(out.blob)}]
     file.write_bytes(glb(json.dumps(out.document | change).encode(), bytes(out.blob)))
-    begin = time.process_time()
-    with pytest.raises(ValueError, match=message) as caught:
+    with in_core_seconds(1.0), pytest.raises(ValueError, match=message) as caught:
         read_surfaces(read_gltf(file))
-    assert time.process_time() - begin < 1.0 and "\n" not in str(caught.value) and str(file) in str(caught.value)
+    assert "\n" not in str(caught.value) and str(file) in str(caught.value)
 
 
 def test_values_that_are_not_finite_are_refused(file):
@@ -314,7 +312,5 @@ def test_indices_and_instances_are_bounded(file):
     many = out.accessor(np.tile(np.arange(3, dtype=np.uint8), 100_000), "SCALAR")
     primitive["indices"] = many
     out.document["nodes"] *= 10_000  # 10,000 times 100,000 triangles
-    begin = time.process_time()
-    with pytest.raises(ValueError, match=r"over \d+ vertices.*simplify"):
+    with in_core_seconds(1.0), pytest.raises(ValueError, match=r"over \d+ vertices.*simplify"):
         read_surfaces(read_gltf(out.save(file)))
-    assert time.process_time() - begin < 1.0
