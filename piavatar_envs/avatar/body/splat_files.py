@@ -232,7 +232,8 @@ def _ascii_rows(stream: BinaryIO, vertex: _Element, size: int) -> np.ndarray:
         words = line.split()
         if len(words) != width:
             raise ValueError(f"row {index} of its vertices has {len(words)} numbers, not {width}")
-        rows[index] = words
+        with np.errstate(over="ignore"):  # infinite, and refused as such
+            rows[index] = words
     return rows.view([(name, np.float32) for name in vertex.types])[:, 0]
 
 
