@@ -18,7 +18,7 @@ from piavatar_envs.avatar.body.registration import POSES
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.smpl_file import FIRST_HAND_JOINT, MODELS
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.body.sources.mesh import UPS, check_up, in_metres, nearest_fit
+from piavatar_envs.avatar.body.sources.mesh import GLTF, UPS, check_up, in_metres, nearest_fit, plausible_ups
 from piavatar_envs.avatar.body.splat_files import read_splats
 from piavatar_envs.avatar.body.splat_registration import (
     OPAQUE,
@@ -81,7 +81,9 @@ def build(
         return _fitted(asset, placed, starts, rotations, Path(path).name), placed
 
     size = np.ptp(opaque_box(cloud), axis=0)
-    fitted, placed = fit(up) if up else nearest_fit(fit, _usual_ups(size, Path(path)), size, MOST_RESIDUAL)
+    # the specification of glTF says that y does
+    usual = ["y"] if Path(path).suffix.lower() in GLTF else plausible_ups(("z", "y", "-z", "-y"), size)
+    fitted, placed = fit(up) if up else nearest_fit(fit, usual, size, MOST_RESIDUAL)
     tall = float(np.ptp(fitted.posed[:, 2]))
     if fitted.residual > MOST_RESIDUAL:
         raise ValueError(
@@ -142,13 +144,6 @@ def _check_extent(cloud: SplatCloud, name: str) -> None:
                 f"{name}: {count} splats are {what} {most * height:.4g} in the file's unit, {most:g} times the body's "
                 "height; delete them, as in SuperSplat"
             )
-
-
-def _usual_ups(size: np.ndarray, path: Path) -> tuple[str, ...]:
-    """Return the axes that point up in most files, of those that a person's proportions allow."""
-    if path.suffix.lower() in (".glb", ".gltf"):
-        return ("y",)  # as its specification says
-    return {0: ("z", "y", "-z", "-y"), 1: ("z", "-z"), 2: ("y", "-y")}[int(size.argmin())]
 
 
 def _in_metres(name: str, cloud: SplatCloud, height: float | None) -> SplatCloud:

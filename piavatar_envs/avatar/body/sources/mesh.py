@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -26,9 +26,9 @@ from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Endings of files that only this source reads.
 SUFFIXES = (".obj", ".ply", ".stl", ".off")
-_GLTF = (".glb", ".gltf")
+GLTF = (".glb", ".gltf")
 #: All formats that it reads.
-FORMATS = (*SUFFIXES, *_GLTF)
+FORMATS = (*SUFFIXES, *GLTF)
 #: Greatest mean distance between the surface and the registered body, over the height.
 MOST_RESIDUAL = 0.015
 #: Units that a height is tried in [m].
@@ -82,7 +82,8 @@ def read_character(path: str, height: float | None = None, up: str | None = None
         return _registered(name, scaled, faces), scaled, matrix, (f"{axis} points up", *note)
 
     size = np.ptp(vertices, axis=0)
-    usual = _usual_ups(size, Path(path).suffix.lower())
+    # the specification of glTF says that y does
+    usual = ["y"] if Path(path).suffix.lower() in GLTF else plausible_ups(("z", "y"), size)
     registered, scaled, matrix, notes = fit(up) if up else nearest_fit(fit, usual, size, MOST_RESIDUAL)
     tall = float(np.ptp(scaled[:, 2]))
     if registered.residual > MOST_RESIDUAL:
@@ -124,7 +125,7 @@ def load_surface(path: Path) -> _Loaded:
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(FORMATS)}")
     check_file(path)
-    loaded = (_load_gltf if path.suffix.lower() in _GLTF else _load_other)(path)
+    loaded = (_load_gltf if path.suffix.lower() in GLTF else _load_other)(path)
     if not len(loaded.faces):
         raise ValueError(
             f"{path.name} has no triangles; export a surface, not points, curves or an empty scene, or use the source "
@@ -224,8 +225,7 @@ def check_up(up: str | None) -> None:
 def nearest_fit(fit: Callable[[str], _Fit], usual: Sequence[str], size: np.ndarray, most: float) -> _Fit:
     """Return the fit of the axis for which the body is nearest to the file.
 
-    Where no usual axis is the right one, the others are tried, but for that from front to back, along which a person is
-    least deep.
+    Where no usual axis is the right one, the others that are plausible are tried.
 
     Args:
         fit: gives the fit for an axis of :data:`UPS`, of which the first item has a ``residual``.
@@ -235,19 +235,16 @@ def nearest_fit(fit: Callable[[str], _Fit], usual: Sequence[str], size: np.ndarr
     """
     fits = [fit(axis) for axis in usual]
     if min(one[0].residual for one in fits) > most:
-        deep = "xyz"[int(np.argmin(size))]
-        for axis in UPS:
-            if axis not in usual and axis[-1] != deep:
+        for axis in plausible_ups(UPS, size):
+            if axis not in usual:
                 with suppress(ValueError):  # along that axis it has no height of a person
                     fits.append(fit(axis))
     return min(fits, key=lambda one: one[0].residual)
 
 
-def _usual_ups(size: np.ndarray, suffix: str) -> list[str]:
-    """Return the axes that point up in most files, of those that a person's proportions allow."""
-    if suffix in _GLTF:
-        return ["y"]  # as its specification says
-    return {0: ["z", "y"], 1: ["z"], 2: ["y"]}[int(size.argmin())]
+def plausible_ups(axes: Iterable[str], size: np.ndarray) -> list[str]:
+    """Return those of the axes that may point up in a file of this size: a person is least deep from front to back."""
+    return [axis for axis in axes if axis[-1] != "xyz"[int(np.argmin(size))]]
 
 
 def in_metres(name: str, vertices: np.ndarray, height: float | None) -> tuple[np.ndarray, tuple[str, ...]]:
