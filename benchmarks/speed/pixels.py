@@ -40,8 +40,6 @@ class Options(VectorOptions):
     sizes: tuple[int, ...] = SIZES
     #: numbers of environments; by default 256 and 1024 on a GPU and one on a CPU
     num_envs: tuple[int, ...] = ()
-    #: further settings of the environments, such as pixels.depth=true
-    settings: tuple[str, ...] = ()
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:

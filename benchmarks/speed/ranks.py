@@ -1,4 +1,4 @@
-"""Speed of a training run on one and several GPUs, and its time to a share of successes.
+"""Speed of a training run on one and several GPUs, and its time to shares of successes.
 
 ``python -m benchmarks.speed.ranks --device cuda --ranks 1 2 4 --out benchmarks/results/ranks.json``. Every row is a
 training run by torchrun and rsl_rl, in which each rank has as many environments as the configuration says, so that the
@@ -7,8 +7,9 @@ batch grows with the ranks. A row has
 - ``env_steps_per_s``: of training, over all ranks: control steps of a rollout by the median time of an iteration;
 - ``collect_s`` and ``learn_s``: the medians of its two parts on rank 0, of which learning waits for the slowest rank;
 - ``efficiency``: steps per second and rank, as a share of the first row's;
-- ``seconds_to_success``: time of the iterations until ``--success`` of the episodes that ended in the latest ten have
-  succeeded, under the actions that are drawn while it learns; None where they have not.
+- ``seconds_to_success``: for each share of ``--success``, time of the iterations until that share of the episodes that
+  ended in the latest ten has succeeded, under the actions that are drawn while it learns; None where it has not;
+- ``trained_success``: share of the episodes in which the trained policy succeeds without that noise, and its interval.
 
 With ``--device cuda:0`` all ranks share one GPU, over Gloo: a trial of the command, not a measure of scaling.
 """
@@ -47,8 +48,8 @@ class Options(runner.Options):
     settings: tuple[str, ...] = ()
     #: iterations of a measurement of speed
     iterations: int = 20
-    #: share of successful episodes to be reached by a run as long as the configuration says; none for speed alone
-    success: float | None = None
+    #: shares of successful episodes to be reached by a run as long as the configuration says; none for speed alone
+    success: tuple[float, ...] = ()
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
@@ -76,9 +77,10 @@ def measure(count: int, options: Options, folder: Path) -> dict[str, Any]:
     Raises:
         RuntimeError: the training has failed.
     """
-    settings = [*options.settings, "evaluation.episodes=2"]
-    if options.success is None:
-        settings += [f"iterations={options.iterations}", f"checkpoint_every={options.iterations + 1}"]
+    settings = [*options.settings]
+    if not options.success:
+        length = [f"iterations={options.iterations}", f"checkpoint_every={options.iterations + 1}"]
+        settings += [*length, "evaluation.episodes=2"]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
     command += ["-m", "agents.rsl_rl.train", str(options.config), *settings]
     command += ["--device", options.device, "--out", str(folder)]
@@ -98,8 +100,13 @@ def measure(count: int, options: Options, folder: Path) -> dict[str, Any]:
         "learn_s": median(learn[WARM_UP:]),
         "training_s": results["training_s"],
     }
-    if options.success is not None:
-        row["seconds_to_success"] = time_to(options.success, times, logged)
+    if options.success:
+        trained = next(row for row in results["results"] if row["case"] == "trained")
+        row |= {
+            "seconds_to_success": {str(share): time_to(share, times, logged) for share in options.success},
+            "trained_success": trained["success_once"],
+            "trained_success_interval": trained["success_once_interval"],
+        }
     return row
 
 

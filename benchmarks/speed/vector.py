@@ -55,6 +55,8 @@ class Options(runner.Options):
     seconds: float = 0.5
     #: measurements of each speed; the row has their median
     repeats: int = 5
+    #: further settings of the environments, such as control.resistance=joints
+    settings: tuple[str, ...] = ()
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
@@ -164,7 +166,7 @@ def measure(world: str, num_envs: int, options: Options) -> dict[str, Any]:
     before = timing.array_bytes(options.device)
     api = "torch" if torch_can_use(options.device) else "numpy"
     try:
-        task = make_task(world, options.fidelity)
+        task = make_task(world, options.fidelity, options.settings)
         batched = EpisodeHost(task, num_envs, options.device, api, num_threads=1)
         batched.reset([*range(num_envs)])
         (batch,) = batched.groups
@@ -197,10 +199,12 @@ def measure(world: str, num_envs: int, options: Options) -> dict[str, Any]:
 
 def scaling(world: str, num_envs: int, options: Options) -> dict[str, Any]:
     """Measure the speed-up of two threads over one, in turns, so that a slower minute of the machine hits both."""
-    trainers = {
-        threads: Trainer(EpisodeHost(make_task(world, options.fidelity), num_envs, options.device, "numpy", threads))
-        for threads in (1, 2)
-    }
+
+    def batch(threads: int) -> EpisodeHost:
+        task = make_task(world, options.fidelity, options.settings)
+        return EpisodeHost(task, num_envs, options.device, "numpy", threads)
+
+    trainers = {threads: Trainer(batch(threads)) for threads in (1, 2)}
     for trainer in trainers.values():
         trainer.batched.reset([*range(num_envs)])
     once = replace(options, repeats=1)
