@@ -71,7 +71,7 @@ $(REFERENCES)/.installed: $(STAMP) tests/avatar/requirements.txt
 	@touch $@
 
 test-avatars: $(REFERENCES)/.installed
-	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py splats.py) tests/render/test_film_files.py -k "makehuman or published or body_models or pybvh or gsply or usd"
+	PYTHONPATH=$(REFERENCES) $(PYTEST) $(addprefix tests/avatar/test_,makehuman_rigs.py published_files.py smpl_file.py smplx_source.py recordings.py splats.py) $(addprefix tests/render/test_,film_files.py garments.py) --no-skips -k "makehuman or published or body_models or pybvh or gsply or usd"
 
 # Libraries of vision-language models, in a folder of their own; the model is written by the tests.
 VLM := $(VENV)/vlm

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import sparse
+from scipy.spatial import cKDTree
 
 from piavatar_envs.api.pictures import MouseForce, SceneReader, grip_at
 from piavatar_envs.avatar.body.outfit import KITS
@@ -13,6 +15,7 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.gltf import read_gltf
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.srgb import linear_to_srgb
+from piavatar_envs.export import Recording
 from piavatar_envs.render.film_files import film_writer
 from piavatar_envs.render.garments import GarmentMesh, both_sides, garment_names
 from piavatar_envs.render.live import Drag
@@ -230,6 +233,39 @@ def test_films_have_garments(film, kind, tmp_path):
     np.testing.assert_array_equal(triangles, faces)
     np.testing.assert_allclose(painted, colors, atol=0.6)
     assert len(np.unique(colors, axis=0)) == 2
+
+
+def test_usd_has_the_cloth_of_every_state(make_env, tmp_path):
+    """Check that garments of a recording are at the places that the simulation had, in the order of the outfit."""
+    usd = pytest.importorskip("pxr.Usd", reason="needs the extra usd")
+    from pxr import UsdGeom
+
+    outfit = [{"kind": "skirt", "length": 0.4, "edge": 0.07}, {"kind": "scarf", "edge": 0.07}]
+    env = make_env(REACH, garments=outfit)
+    env.reset(seed=0)
+    recording, cloth = Recording(env, tmp_path / "film", "usd"), env.batch.simulation.garments
+    states = []
+    for _ in range(6):
+        env.step(env.action_space.sample())
+        recording.add()
+        states.append(env.batch.get_state()["cloth.x"][0].astype(np.float64))
+    assert np.ptp(states, axis=0).max() > 0.02
+    stage = usd.Stage.Open(str(recording.finish()[0]))
+    first = 0
+    for number, garment in enumerate(cloth.garments):
+        drawn = GarmentMesh.of(garment, cloth.garments[number + 1 :])
+        prim = UsdGeom.Mesh(stage.GetPrimAtPath(f"/film/body_{number + 1}"))
+        faces = np.reshape(prim.GetFaceVertexIndicesAttr().Get(), (-1, 3))
+        np.testing.assert_array_equal(faces, drawn.faces)
+        own = sparse.csr_array(tuple(reversed(drawn.rows)))
+        for frame, state in enumerate(states):
+            x = state[first : first + garment.mesh.num_vertices]
+            outer, inner = np.array(prim.GetPointsAttr().Get(frame), np.float64).reshape(2, -1, 3)
+            sunk = np.linalg.norm(0.5 * (outer + inner) - own @ x, axis=1)  # beneath what is worn over it
+            np.testing.assert_allclose(sunk, drawn.depth, atol=1e-5)
+            assert (sunk < 1e-5).mean() > 0.7
+            assert cKDTree(0.5 * (outer + inner)).query(x)[0].max() < 0.05  # smooth, but within an edge of the cloth
+        first += garment.mesh.num_vertices
 
 
 def test_names_are_of_the_wearer_and_the_kind():
