@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.tracking import moments_of
 from piavatar_envs.avatar.types import Body, PoseControl
 from piavatar_envs.core.arrays import float_at, int_at, number_at, vec8, vec12, vec16, vector_at
 from piavatar_envs.core.cuda_intrinsics import BLOCK, place_in_chunks, sum_threads12
@@ -180,21 +181,6 @@ def entry_of(body: Body, n: int, last: int):
     at = wp.min(n, last)
     weight = float_at(body.entry_weight, at)
     return int_at(body.entry, at), wp.where(n > last, 0.0, weight)
-
-
-@wp.func
-def moments_of(w: float, d: wp.vec3, v: wp.vec3):
-    """Return the moments of a mass ``w`` at ``d`` with velocity ``v``: m, m d, m v, m d d^T, m d x v."""
-    p = w * v
-    wd = w * d
-    l = wp.cross(wd, v)
-    # fmt: off
-    return vec16(
-        w, wd[0], wd[1], wd[2], p[0], p[1], p[2],
-        wd[0] * d[0], wd[1] * d[1], wd[2] * d[2], wd[1] * d[2], wd[2] * d[0], wd[0] * d[1],
-        l[0], l[1], l[2],
-    )
-    # fmt: on
 
 
 @wp.func

@@ -48,8 +48,23 @@ def symmetric(diag: wp.vec3, off: wp.vec3):
 
 
 @wp.func
+def moments_of(w: float, d: wp.vec3, v: wp.vec3):
+    """Return the moments of a mass ``w`` at ``d`` with velocity ``v``: m, m d, m v, m d d^T, m d x v."""
+    p = w * v
+    wd = w * d
+    l = wp.cross(wd, v)
+    # fmt: off
+    return vec16(
+        w, wd[0], wd[1], wd[2], p[0], p[1], p[2],
+        wd[0] * d[0], wd[1] * d[1], wd[2] * d[2], wd[1] * d[2], wd[2] * d[0], wd[0] * d[1],
+        l[0], l[1], l[2],
+    )
+    # fmt: on
+
+
+@wp.func
 def summed_second_moment(s: vec16):
-    """Return the second moment [kg m^2] of the sums over a bone or a prop, which have it from component 7 on."""
+    """Return the second moment [kg m^2] of sums of :func:`moments_of`, which have it from component 7 on."""
     return symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
 
 
@@ -63,6 +78,34 @@ def inertia_of(second: wp.mat33):
 def point_inertia(mass: float, d: wp.vec3):
     """Return the inertia of a point mass at ``d``."""
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
+
+
+@wp.struct
+class RigidMotion:
+    """Rigid motion of matter that has its momentum and angular momentum."""
+
+    mass: float  # [kg]
+    center: wp.vec3  # of mass [m]
+    velocity: wp.vec3  # there [m/s]
+    spin: wp.vec3  # angular velocity [rad/s]
+    inertia: wp.mat33  # about the centre of mass [kg m^2]
+
+
+@wp.func
+def fit_moments(s: vec16):
+    """Return the :class:`RigidMotion` of matter whose moments, see :func:`moments_of`, add up to ``s``.
+
+    Its centre is relative to the point, and its velocity to the velocity, that the moments are about.
+    """
+    motion = RigidMotion()
+    motion.mass = wp.max(s[0], 1.0e-12)
+    d = wp.vec3(s[1], s[2], s[3]) / motion.mass
+    motion.center = d
+    motion.velocity = wp.vec3(s[4], s[5], s[6]) / motion.mass
+    motion.inertia = inertia_of(summed_second_moment(s) - motion.mass * wp.outer(d, d))
+    L = wp.vec3(s[13], s[14], s[15]) - motion.mass * wp.cross(d, motion.velocity)
+    motion.spin = spin_of(motion.inertia, L)
+    return motion
 
 
 @wp.func
@@ -84,15 +127,11 @@ def fit_bone(
     s = sum_threads16(s, threads)
     if thread > 0:
         return
-    m = wp.max(s[0], 1.0e-12)
-    d = wp.vec3(s[1], s[2], s[3]) / m
-    V = wp.vec3(s[4], s[5], s[6]) / m
-    I = inertia_of(summed_second_moment(s) - m * wp.outer(d, d))
-    L = wp.vec3(s[13], s[14], s[15]) - m * wp.cross(d, V)
-    bones.center[e, b] = reference[e, b] + d
-    bones.velocity[e, b] = V
-    bones.spin[e, b] = spin_of(I, L)
-    bones.inertia[e, b] = I
+    motion = fit_moments(s)
+    bones.center[e, b] = reference[e, b] + motion.center
+    bones.velocity[e, b] = motion.velocity
+    bones.spin[e, b] = motion.spin
+    bones.inertia[e, b] = motion.inertia
 
 
 @wp.func

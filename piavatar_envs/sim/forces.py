@@ -32,11 +32,10 @@ from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS
 from piavatar_envs.avatar.controller import Controller
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.segment_sums import moments_of
 from piavatar_envs.avatar.skinning import unpack
 from piavatar_envs.avatar.torque_control.bone_contact import moves_bone
 from piavatar_envs.avatar.torque_control.joint_motion import set_triple
-from piavatar_envs.avatar.tracking import inertia_of, spin_of, summed_second_moment
+from piavatar_envs.avatar.tracking import fit_moments, moments_of, spin_of
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.core.arrays import vec16
 from piavatar_envs.core.cuda_intrinsics import (
@@ -511,18 +510,16 @@ def solve_fields(
     s = vec16()
     for c in range(targets.start[target], targets.start[target + 1]):
         s += fields.moments[e, c]
-    d = wp.vec3(s[1], s[2], s[3]) / s[0]
-    inertia = inertia_of(summed_second_moment(s) - s[0] * wp.outer(d, d))
-    center = origin_of(targets, x, e, target) + d
+    motion = fit_moments(s)
+    center = origin_of(targets, x, e, target) + motion.center
     arm = fields.arm[e, i]
     if step == 0:
         arm = fields.at[e, i] - center
     fields.center[e, i] = center
-    fields.velocity[e, i] = dt / s[0] * slots.force[e, i]
-    spin = spin_of(inertia, dt * wp.cross(arm, slots.force[e, i]))
+    fields.velocity[e, i] = dt / motion.mass * slots.force[e, i]
+    spin = spin_of(motion.inertia, dt * wp.cross(arm, slots.force[e, i]))
     fields.spin[e, i] = spin
-    own = spin_of(inertia, wp.vec3(s[13], s[14], s[15]) - wp.cross(d, wp.vec3(s[4], s[5], s[6])))
-    fields.arm[e, i] = wp.quat_rotate(quat_exp(dt * (own + spin)), arm)
+    fields.arm[e, i] = wp.quat_rotate(quat_exp(dt * (motion.spin + spin)), arm)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 8))

@@ -20,10 +20,9 @@ from dataclasses import dataclass
 import warp as wp
 
 from piavatar_envs.avatar.pose_control.bone_contact import Rigid, response_at
-from piavatar_envs.avatar.segment_sums import moments_of
 from piavatar_envs.avatar.skinning import motion_at
 from piavatar_envs.avatar.torque_control.bone_contact import TOLERANCE, stopping_impulse
-from piavatar_envs.avatar.tracking import inertia_of, kabsch_rotation, spin_of, summed_second_moment
+from piavatar_envs.avatar.tracking import kabsch_rotation, spin_of
 from piavatar_envs.core.arrays import vec8, vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import signed_distance, surface_velocity
@@ -32,7 +31,7 @@ from piavatar_envs.mpm.contact_sensors import add_impulse, boundary_entry, momen
 from piavatar_envs.mpm.thin_colliders import parts_matter
 from piavatar_envs.mpm.types import Boundaries, Contact, Grid, Model, Particles, Scratch, Sensors, State, Step, row
 from piavatar_envs.sim.prop_geometry import PropPoints
-from piavatar_envs.sim.props import Prop
+from piavatar_envs.sim.props import Prop, add_moments, fit_prop
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,8 +89,9 @@ class PropCores:
         for own in self._own:
             sums = [own.moments, own.correlation]
             graph.launch(sum_prop, own.moments.shape, [own.prop, m.particles, s.x, s.u, s.vk, s.failure], sums)
-            inputs = [m.grid, m.step, m.boundaries, m.contact, m.thin_colliders, own.prop, own.field, s.x, *sums]
-            graph.launch(stop_core, m.num_envs, [*inputs, s.failure], [scratch.sensors, own.core])
+            inputs = [m.grid, m.step, m.boundaries, m.contact, m.thin_colliders, own.prop, own.field]
+            inputs += [s.x, s.u, s.vk, *sums, s.failure]
+            graph.launch(stop_core, m.num_envs, inputs, [scratch.sensors, own.core])
             shape = m.num_envs, int(own.prop.count)
             graph.launch(apply_change, shape, [own.prop, own.core, s.x, s.failure], [s.u])
 
@@ -112,15 +112,7 @@ def sum_prop(
     e, share = wp.tid()
     if failure[e] != 0:
         return
-    r = row(e, particles.mass.shape[0])
-    origin = x[e, prop.first]
-    total = vec16()
-    H = wp.mat33()
-    for p in range(share, prop.count, moments.shape[1]):
-        q = prop.first + p
-        m = particles.mass[r, q]
-        total += moments_of(m, x[e, q] - origin, u[e, q] + vk[e, q])
-        H += m * wp.outer(x[e, q] - origin, prop.rest[p])
+    total, H = add_moments(prop, particles, x, u, vk, e, share, moments.shape[1])
     moments[e, share] = total
     correlation[e, share] = H
 
@@ -171,6 +163,8 @@ def stop_core(
     prop: Prop,
     field: int,
     x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
     moments: wp.array2d(dtype=vec16),
     correlation: wp.array2d(dtype=wp.mat33),
     failure: wp.array(dtype=int),
@@ -190,13 +184,13 @@ def stop_core(
     for share in range(moments.shape[1]):
         s += moments[e, share]
         H += correlation[e, share]
+    fit = fit_prop(prop, x, u, vk, e, s)
     own = Rigid()
-    own.mass = s[0]
-    arm = wp.vec3(s[1], s[2], s[3]) / own.mass
-    own.center = x[e, prop.first] + arm
-    velocity = wp.vec3(s[4], s[5], s[6]) / own.mass
-    own.inertia = inertia_of(summed_second_moment(s) - own.mass * wp.outer(arm, arm))
-    spin = spin_of(own.inertia, wp.vec3(s[13], s[14], s[15]) - own.mass * wp.cross(arm, velocity))
+    own.mass = fit.mass
+    own.center = fit.center
+    own.inertia = fit.inertia
+    velocity = fit.velocity
+    spin = fit.spin
     start = vec8(velocity[0], velocity[1], velocity[2], spin[0], spin[1], spin[2], 0.0, 0.0)
     motion = start
     core.center[e] = own.center

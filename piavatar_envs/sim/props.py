@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.tracking import kabsch_rotation, point_inertia, spin_of
+from piavatar_envs.avatar.tracking import fit_moments, kabsch_rotation, moments_of
 from piavatar_envs.config import ColliderConfig, ConfigError, PhysicsConfig, PropConfig
 from piavatar_envs.config.schema import LEAST_DENSITY, MOST_DENSITY
-from piavatar_envs.core.arrays import store_matrix
+from piavatar_envs.core.arrays import store_matrix, vec16
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.materials import lame_parameters, retardation_time
 from piavatar_envs.mpm.model import MaterialPoints
@@ -304,6 +304,52 @@ def place_prop(
     driven.spin[e, q] = wp.vec3(0.0)
 
 
+@wp.func
+def add_moments(
+    prop: Prop,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    e: int,
+    share: int,
+    shares: int,
+):
+    """Sum moments and the correlation with the rest shape over one of ``shares`` of a prop's particles.
+
+    Both are about the prop's first particle and relative to its velocity, because sums about the world's origin, or of
+    the velocity of a fast prop, lose more digits.
+    """
+    r = row(e, particles.mass.shape[0])
+    origin = x[e, prop.first]
+    base = u[e, prop.first] + vk[e, prop.first]
+    moments = vec16()
+    correlation = wp.mat33()
+    for p in range(share, prop.count, shares):
+        q = prop.first + p
+        m = particles.mass[r, q]
+        d = x[e, q] - origin
+        moments += moments_of(m, d, u[e, q] + vk[e, q] - base)
+        correlation += m * wp.outer(d, prop.rest[p])
+    return moments, correlation
+
+
+@wp.func
+def fit_prop(
+    prop: Prop,
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    e: int,
+    moments: vec16,
+):
+    """Return the rigid motion of a prop in the world, by its ``moments`` of :func:`add_moments`."""
+    motion = fit_moments(moments)
+    motion.center += x[e, prop.first]
+    motion.velocity += u[e, prop.first] + vk[e, prop.first]
+    return motion
+
+
 @wp.kernel
 def track_prop(
     prop: Prop,
@@ -327,39 +373,20 @@ def track_prop(
     e = wp.tid()
     if failure[e] != 0:
         return
+    moments, correlation = add_moments(prop, particles, x, u, vk, e, 0, 1)
+    motion = fit_prop(prop, x, u, vk, e, moments)
+    c = motion.center
+    R = kabsch_rotation(correlation)
     r = row(e, particles.mass.shape[0])
-    origin = x[e, prop.first]  # sums about a point of the prop lose fewer digits than sums about the world's origin
-    mass = float(0.0)
-    mx = wp.vec3()
-    mv = wp.vec3()
-    for p in range(prop.count):
-        q = prop.first + p
-        m = particles.mass[r, q]
-        mass += m
-        mx += m * (x[e, q] - origin)
-        mv += m * (u[e, q] + vk[e, q])
-    c = origin + mx / mass
-    V = mv / mass
-    H = wp.mat33()
-    I = wp.mat33()
-    L = wp.vec3()
-    for p in range(prop.count):
-        q = prop.first + p
-        m = particles.mass[r, q]
-        d = x[e, q] - c
-        H += m * wp.outer(d, prop.rest[p])
-        I += point_inertia(m, d)
-        L += m * wp.cross(d, u[e, q] + vk[e, q] - V)
-    R = kabsch_rotation(H)
     square = float(0.0)
     for p in range(prop.count):
         q = prop.first + p
         square += particles.mass[r, q] * wp.length_sq(x[e, q] - c - R * prop.rest[p])
     position[e, index] = c
     rotation[e, index] = wp.normalize(wp.quat_from_matrix(R))
-    velocity[e, index] = V
-    spin[e, index] = spin_of(I, L)
-    deformation[e, index] = wp.sqrt(square / mass)
+    velocity[e, index] = motion.velocity
+    spin[e, index] = motion.spin
+    deformation[e, index] = wp.sqrt(square / motion.mass)
 
 
 @wp.kernel

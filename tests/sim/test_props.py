@@ -142,6 +142,17 @@ def test_tracking_reads_back_what_was_placed(device):
     assert np.all(others == np.float32(POISON))
 
 
+def test_a_prop_that_only_flies_has_the_velocity_of_its_particles_and_no_spin(device):
+    # to the bit: sums of the velocities themselves lose as many digits as the prop is fast and has particles
+    scene, rng = Scene(device), np.random.default_rng(3)
+    scene.place(rng)
+    velocity = (30.0 * rng.normal(size=(NUM_ENVS, 1, 3))).astype(np.float32)
+    scene.write("u", velocity)
+    scene.write("vk", 0.0)
+    tracked = scene.track()
+    assert np.array_equal(tracked["velocity"], velocity[:, 0]) and not tracked["spin"].any()
+
+
 @pytest.mark.parametrize("rows", ["shared", "own"])
 def test_fit_of_a_deformed_prop_against_numpy(device, rows):
     # Kabsch, momentum and angular momentum of a prop whose particles are shaken, in double precision.

@@ -12,10 +12,9 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.pose_control.root import answer_motion, pull_root
-from piavatar_envs.avatar.segment_sums import moments_of
 from piavatar_envs.avatar.torque_control.commanded_motion import CommandedMotion
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
-from piavatar_envs.avatar.tracking import inertia_of, point_inertia, spin_of, summed_second_moment
+from piavatar_envs.avatar.tracking import fit_moments, moments_of
 from piavatar_envs.avatar.types import Body, PoseControl, RootState, Wrench
 from piavatar_envs.core.arrays import number_at, set_vector, vec8, vec16, vector_at
 from piavatar_envs.core.cuda_intrinsics import (
@@ -119,14 +118,12 @@ def support_body(
         s += support.moments[e, group]
         whole += support.momenta[e, group]
         change += support.changes[e, group]
-    mass = s[0]
-    center = wp.vec3(s[1], s[2], s[3]) / mass
-    momentum = wp.vec3(s[4], s[5], s[6])
-    inertia = inertia_of(summed_second_moment(s)) - point_inertia(mass, center)
-    spin = spin_of(inertia, wp.vec3(s[13], s[14], s[15]) - wp.cross(center, momentum))
+    own = fit_moments(s)
+    mass = own.mass
+    center = own.center
     pull_root(
-        control, fraction, begins != 0, motion.command, w.pose.rotation[e, 0], w.pose.position[e, 0], momentum / mass,
-        spin, inertia, mass, e, root, wrench,
+        control, fraction, begins != 0, motion.command, w.pose.rotation[e, 0], w.pose.position[e, 0], own.velocity,
+        own.spin, own.inertia, mass, e, root, wrench,
     )  # fmt: skip
     P = wp.vec3(whole[0], whole[1], whole[2])
     moved = w.pose.position[e, 0] - w.pelvis[e]
@@ -137,13 +134,13 @@ def support_body(
     P = wp.vec3(change[0], change[1], change[2])
     L = wp.vec3(change[3], change[4], change[5]) - wp.cross(center, P)
     P += mass * (recoil + wp.cross(turn, center))
-    L += inertia * turn
+    L += own.inertia * turn
     need = P + wrench.owed[e]
     need_turn = L + wrench.owed_turn[e]
     if control.free_motion != 0 or control.root_rate <= 0.0:
         need = wp.vec3(0.0)
         need_turn = wp.vec3(0.0)
-    V, W = answer_motion(control, mass, inertia, P, L, need, need_turn, e, 0, wrench, root)
+    V, W = answer_motion(control, mass, own.inertia, P, L, need, need_turn, e, 0, wrench, root)
     V -= wp.cross(W, center)
     support.motion[e] = vec8(V[0], V[1], V[2], W[0], W[1], W[2], 0.0, 0.0)
 
