@@ -31,6 +31,8 @@ Color = tuple[float, float, float]
 
 #: Stretch stiffness beyond which 20 substeps with 4 sweeps gain nothing [N/m].
 MOST_STRETCH = 500.0
+#: Substeps of cloth that may be set for a control step, at most; stiff bending needs many.
+MOST_CLOTH_SUBSTEPS = 1000
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.sparse.linalg import eigsh
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +103,21 @@ class ClothMesh:
     def face_area(self) -> np.ndarray:
         """Areas of the triangles [m^2], shape ``(T,)``."""
         return _areas(self.length[self.sides])
+
+    def stiffest_bending(self, held: np.ndarray) -> float:
+        """Return the greatest eigenvalue of bending [1/m^4]: of Q over the areas of the vertices.
+
+        A wave of this kind has the frequency ``sqrt(D / sigma)`` times its root [rad/s], the highest of the mesh.
+
+        Args:
+            held: vertices that do not move, shape ``(H,)``.
+        """
+        root = 1.0 / np.sqrt(self.area)
+        root[held] = 0.0
+        q = sparse.csr_array((self.bending_value, self.bending_column, self.bending_start), shape=2 * (len(root),))
+        scaled = sparse.diags_array(root) @ q @ sparse.diags_array(root)
+        start = np.random.default_rng(0).standard_normal(len(root))  # the library's own would differ from run to run
+        return float(eigsh(scaled, k=1, v0=start, tol=1e-3, return_eigenvectors=False)[0])
 
     def strain(self, positions: np.ndarray) -> np.ndarray:
         """Return how much longer than in the pattern the edges are, relative to it.

@@ -127,6 +127,27 @@ class Textile:
         return wp.array(np.ascontiguousarray(values, np.float32), dtype=wp.vec3, device=self.device)
 
 
+def fastest_bending(garment: Garment, factor: float = 1.0) -> float:
+    """Return the highest frequency of bending of a garment [rad/s], its stiffness over its mass times ``factor``."""
+    fabric, held = garment.fabric, garment.held.vertices
+    stiffest = garment.mesh.stiffest_bending(held) if fabric.bending > 0.0 else 0.0
+    return float(np.sqrt(factor * fabric.bending / fabric.areal_density * stiffest))
+
+
+def longest_substep(every: int, frequency: float) -> float:
+    """Return the longest substep in which waves of a ``frequency`` [rad/s] do not grow [s].
+
+    A force is that in the middle of ``every`` substeps, for which it stays. The step maps place and velocity linearly;
+    by its trace and determinant, waves grow where ``every (every + 1) (frequency dt)^2`` is more than 4.
+    """
+    return 2.0 / (np.sqrt(every * (every + 1)) * max(frequency, 1e-12))
+
+
+def fewest_substeps(frequency: float, control_dt: float) -> int:
+    """Return how many substeps a control step [s] needs at least if forces are evaluated in each of them."""
+    return int(np.ceil(control_dt / longest_substep(1, frequency)))
+
+
 class Cloth(Textile):
     """All garments of a world, advanced by small steps of extended position-based dynamics; see :class:`Textile`."""
 
@@ -142,8 +163,11 @@ class Cloth(Textile):
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
         device: str = "cpu",
         rows: int = 1,
+        factor: float = 1.0,
     ) -> None:
         """Upload the garments, draped and at rest.
+
+        Forces are evaluated more often than in the settings where stiff bending needs it.
 
         Args:
             garments: at least one.
@@ -155,9 +179,10 @@ class Cloth(Textile):
             gravity: acceleration [m/s^2].
             device: Warp device.
             rows: 1 for the same lengths and fabrics in all environments, else ``num_envs``.
+            factor: greatest one on bending stiffness over mass that a reset may write.
 
         Raises:
-            ValueError: a garment is worn by a piece that the obstacles lack.
+            ValueError: a garment is worn by a piece that the obstacles lack, or its bending needs more substeps.
         """
         self._obstacles = no_obstacles(num_envs, device) if obstacles is None else obstacles
         self._boundaries = make_boundaries([], 1, 1, device) if boundaries is None else boundaries
@@ -166,7 +191,7 @@ class Cloth(Textile):
             if garment.wearer >= pieces:
                 raise ValueError(f"a {garment.kind} is worn by piece {garment.wearer}; the obstacles have {pieces}")
         super().__init__(garments, settings, num_envs, control_dt, device, rows, first_faces(self._obstacles))
-        self._constants = self._make_constants(gravity)
+        self._constants = self._make_constants(gravity, factor)
         self._workspace, self._touches = self._allocate()
         enabled = self.settings.self_collision
         self._self_contacts = allocate_self_contacts(self.mesh, rows_of(num_envs, device), device, enabled)
@@ -192,12 +217,24 @@ class Cloth(Textile):
         """Threads of an environment: a CUDA block, one on a CPU."""
         return THREADS if wp.get_device(self.device).is_cuda else 1
 
-    def _make_constants(self, gravity: Sequence[float]) -> Constants:
+    def _make_constants(self, gravity: Sequence[float], factor: float) -> Constants:
         settings = self.settings
+        dt, frequency = self.control_dt / settings.substeps, [fastest_bending(own, factor) for own in self.garments]
+        every = [n for n in range(1, settings.forces_every + 1) if dt <= longest_substep(n, max(frequency))]
+        if not every:
+            garment = self.garments[int(np.argmax(frequency))]
+            raise ValueError(
+                f"cloth.substeps={settings.substeps} are too few for the bending of the {garment.kind} "
+                f"(bending {garment.fabric.bending:g} N m, {garment.fabric.areal_density:g} kg/m^2, edges of "
+                f"{1e3 * garment.mesh.length.mean():.0f} mm{_by(factor)}), which needs at least "
+                f"{fewest_substeps(max(frequency), self.control_dt)}; set it, or give the garment less `bending` or a "
+                "longer `edge`"
+            )
         return fill(
             Constants(),
             settings,
-            dt=self.control_dt / settings.substeps,
+            forces_every=every[-1],
+            dt=dt,
             gravity=wp.vec3(*map(float, gravity)),
             wind=wp.vec3(*map(float, settings.wind)),
             keep=1.0 - settings.damping,
@@ -232,6 +269,11 @@ class Cloth(Textile):
             **{name: vectors(slots * vertices) for name in ("point", "way", "normal", "impulse", "moment")},
         )
         return workspace, touches
+
+
+def _by(factor: float) -> str:
+    """Return a part of a message that names a factor on bending stiffness over mass, if there is one."""
+    return "" if factor == 1.0 else f", times up to {factor:.3g} by `randomize`"
 
 
 def bytes_of_cloth(

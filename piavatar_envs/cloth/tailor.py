@@ -25,13 +25,13 @@ from piavatar_envs.cloth import bodice, contact, kernels, panels, pattern, remes
 from piavatar_envs.cloth import mesh as meshing
 from piavatar_envs.cloth import wearer as wearers
 from piavatar_envs.cloth.cut import Cut
-from piavatar_envs.cloth.fabric import Fabric
+from piavatar_envs.cloth.fabric import MOST_CLOTH_SUBSTEPS, Fabric
 from piavatar_envs.cloth.garment import Garment, Held
 from piavatar_envs.cloth.garments import cut_garment, cutter
 from piavatar_envs.cloth.mesh import ClothMesh
 from piavatar_envs.cloth.obstacles import Obstacles, Piece, allocate
 from piavatar_envs.cloth.proxy import Proxy, curved, proxy_of
-from piavatar_envs.cloth.solver import Cloth
+from piavatar_envs.cloth.solver import Cloth, fastest_bending, fewest_substeps
 from piavatar_envs.cloth.types import ClothSettings
 from piavatar_envs.cloth.wearer import Wearer
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -176,9 +176,17 @@ def drape(garment: Garment, wearer: Wearer, proxy: Proxy, longest: float = _LONG
         longest: time after which it ends in any case [s].
 
     Raises:
-        ValueError: the cloth does not stay finite.
+        ValueError: the cloth does not stay finite, or bends too stiffly for any number of substeps that may be set.
     """
     settings = ClothSettings(damping=_DAMPING)
+    needed = fewest_substeps(fastest_bending(garment), _STEP)
+    if needed > MOST_CLOTH_SUBSTEPS:
+        raise ValueError(
+            f"bending={garment.fabric.bending:g} N m of the {garment.kind} needs {needed} substeps of cloth at "
+            f"{garment.fabric.areal_density:g} kg/m^2 and edges of {1e3 * garment.mesh.length.mean():.0f} mm; at most "
+            f"{MOST_CLOTH_SUBSTEPS} can be set: use less `bending` or a longer `edge`"
+        )
+    settings = replace(settings, substeps=max(settings.substeps, needed))
     cloth = Cloth([garment], still(wearer, proxy), None, settings, num_envs=1, control_dt=_STEP, device="cpu")
     failure, graph = wp.zeros(1, dtype=int, device="cpu"), LaunchGraph("cpu")
     cloth.record_step(graph, failure)

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from piavatar_envs.avatar.body.flesh_stiffness import FREE_SHARE
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.body.sources import check_settings, check_source
-from piavatar_envs.cloth.fabric import Fabric, check_fabric, fabric_of
+from piavatar_envs.cloth.fabric import MOST_CLOTH_SUBSTEPS, Fabric, check_fabric, fabric_of
 from piavatar_envs.cloth.garments import check_kind
 from piavatar_envs.cloth.garments import check_settings as check_garment
 from piavatar_envs.config.load import ConfigError, load_config
@@ -399,7 +399,9 @@ class ClothConfig(BaseModel):
         description="xpbd: extended position-based dynamics with small steps; mpm: a thin shell on the grid of the "
         "bodies, for fine grids and comparisons",
     )
-    substeps: int = Field(20, ge=1, le=1000, description="substeps of cloth in a control step, of which 20 suit 1/30 s")
+    substeps: int = Field(
+        20, ge=1, le=MOST_CLOTH_SUBSTEPS, description="substeps of cloth in a control step, of which 20 suit 1/30 s"
+    )
     sweeps: int = Field(4, ge=1, le=100, description="sweeps over the edges in a substep; with fewer, cloth may buzz")
     self_collision: bool = Field(False, description="keep garments apart from themselves and each other")
     wind: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="velocity of the air [m/s]")

@@ -31,7 +31,7 @@ from piavatar_envs.cloth.proxy import ALL_PARTS, PROXY_VERTICES, proxy_of
 from piavatar_envs.cloth.remesh import remesh
 from piavatar_envs.cloth.solver import Cloth, Textile, bytes_of_cloth
 from piavatar_envs.cloth.types import ClothSettings, ClothState
-from piavatar_envs.config import ClothConfig, ConfigError, EnvConfig, GarmentConfig
+from piavatar_envs.config import ConfigError, EnvConfig, GarmentConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.types import Model, State
 from piavatar_envs.sim.bodies import Flesh
@@ -166,7 +166,7 @@ class Garments(WornCloth):
     def __init__(
         self,
         garments: Sequence[Garment],
-        config: ClothConfig,
+        config: EnvConfig,
         flesh: Sequence[Flesh],
         avatars: Sequence[Avatar],
         props: PropSet,
@@ -178,29 +178,37 @@ class Garments(WornCloth):
 
         Args:
             garments: of :func:`tailor`, at least one.
-            config: settings of the solver.
+            config: of the environment.
             flesh: of the world, as all that follows.
             avatars: likewise.
             props: likewise.
             shapes: likewise.
             model: likewise.
             state: likewise.
+
+        Raises:
+            ConfigError: the cloth bends too stiffly for its substeps.
         """
         bodies = enumerate(zip(flesh, avatars, strict=True))
         pieces = [avatar_piece(index, *body, shapes, state) for index, body in bodies]
         pieces += [prop_piece(column, props, state) for column in range(len(props))]
         self.surfaces = ObstacleSurfaces(pieces, model)
-        cloth = Cloth(
-            garments,
-            self.surfaces.obstacles,
-            model.boundaries,
-            ClothSettings(config.substeps, config.sweeps, wind=config.wind, self_collision=config.self_collision),
-            num_envs=model.num_envs,
-            control_dt=model.control_dt,
-            gravity=tuple(model.step.gravity),
-            device=model.device,
-            rows=model.num_envs if is_graded(garments, flesh) else 1,
-        )
+        own, factors = config.cloth, config.randomize
+        try:
+            cloth = Cloth(
+                garments,
+                self.surfaces.obstacles,
+                model.boundaries,
+                ClothSettings(own.substeps, own.sweeps, wind=own.wind, self_collision=own.self_collision),
+                num_envs=model.num_envs,
+                control_dt=model.control_dt,
+                gravity=tuple(model.step.gravity),
+                device=model.device,
+                rows=model.num_envs if is_graded(garments, flesh) else 1,
+                factor=factors.cloth_stiffness_factor[1] / factors.cloth_mass_factor[0],
+            )
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
         super().__init__(garments, cloth, flesh, avatars, shapes, model, state)
 
     def record_begin(self, graph: LaunchGraph) -> None:

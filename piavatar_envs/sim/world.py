@@ -253,7 +253,7 @@ class Simulation:
             garments = ShellGarments(self._tailored, self._shells, self.config.cloth, *of_world, first)
         else:
             bodies = self.flesh, self.avatars, self.props, self.shapes, self.model, self.state
-            garments = Garments(self._tailored, self.config.cloth, *bodies)
+            garments = Garments(self._tailored, self.config, *bodies)
         self.randomization.scale_cloth(garments.cloth.fabric)
         return garments
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs.api.conformance import check_task
+from piavatar_envs.config import ConfigError
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import FAILURE_CLOTH, failure_name
 from piavatar_envs.sim.garments import bytes_of_garments
@@ -75,6 +76,24 @@ def test_a_garment_at_rest_stays_and_its_weight_is_carried(make_env):
     assert np.mean(carried[-30:]) == pytest.approx(body + weight, abs=0.1 * weight)
     assert np.abs(cloth.state.x.numpy() - start).max() < 0.01
     assert np.abs(cloth.state.v.numpy()).max() < 0.05
+
+
+def test_stiff_cloth_of_short_edges_rests_too(make_env):
+    env = make_env(REACH, garments=[{"kind": "scarf", "fabric": "fleece"}], pose_noise=0.0)
+    env.reset(seed=0)
+    for _ in range(20):
+        env.step(np.zeros(env.action_space.shape, np.float32))
+    assert np.abs(env.batch.simulation.garments.cloth.state.v.numpy()).max() < 0.05
+
+
+def test_bending_that_the_substeps_do_not_resolve_is_refused(make_batch):
+    factors = {"cloth_stiffness_factor": [0.1, 10.0], "cloth_mass_factor": [0.1, 1.0]}
+    with pytest.raises(ConfigError, match=r"cloth.substeps=20 .* skirt \(bending 0.03 N m, .*at least \d\d;"):
+        make_batch(REACH, garments=[SKIRT | {"bending": 0.03}])
+    with pytest.raises(ConfigError, match="times up to 100 by `randomize`"):
+        make_batch(REACH, garments=[SKIRT | {"bending": 1e-3}], randomize=factors)
+    with pytest.raises(ConfigError, match=r"bending=1 N m of the skirt needs \d+ substeps .* at most 1000"):
+        make_batch(REACH, garments=[SKIRT | {"length": 0.2, "edge": 0.03, "bending": 1.0, "areal_density": 0.01}])
 
 
 def test_environments_of_a_batch_equal_single_ones(make_batch, equal):
