@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _TIGHT, _LOOSE = 0.014, 0.010
 #: Distance of cloth that lies on a surface, and of cloth that hangs before it, at most [m].
 _NEAR, _FAR = 0.03, 0.15
+#: Depth of cloth in a surface that it covers, at most [m]: outfits lie above the skin, and folds are drawn rounder.
+_THROUGH = 0.015
 #: Ways from a border over which sinking sets in: inside, where cloth lies on a surface and where it hangs apart, which
 #: may be seen; and outside of one that is held, such as a waistband [m].
 _INSIDE, _FAR_INSIDE, _OUTSIDE = 0.03, 0.10, 0.03
@@ -128,7 +130,7 @@ def _covered(
     gap, nearest = cKDTree(places).query(points)
     offset = places[nearest] - points
     # of two layers only the one that faces as the surface does covers it: not a sleeve beside the trunk
-    inside = (np.einsum("vc,vc->v", offset, outward[nearest]) > -0.005) & (gap < _FAR)
+    inside = (np.einsum("vc,vc->v", offset, outward[nearest]) > -_THROUGH) & (gap < _FAR)
     inside &= np.einsum("vc,vc->v", normals, outward[nearest]) > 0.0
     edge = cKDTree(places[border]).query(places)[0][nearest] if len(border) else np.full(len(points), np.inf)
     held_vertices = np.asarray(garment.held.vertices, int)

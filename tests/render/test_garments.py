@@ -124,6 +124,8 @@ def test_skin_sinks_beneath_cloth_and_nowhere_else():
         return sinking(skirt, points, np.tile(way * normal, (8, 1)))
 
     on, loose, outside, other_way = depths(0.195), depths(0.12), depths(0.22), depths(0.195, -1.0)
+    through = depths(0.21)  # as an outfit in a fold
+    assert through[3:5] == pytest.approx(0.014) and through[0] == 0.0
     assert on[:2] == pytest.approx(0.0) and 0.0 < on[2] < on[3] == pytest.approx(on[4]) == pytest.approx(0.014)
     assert 0.0 < on[6] < 0.008 and on[7] == 0.0  # above the waistband
     assert loose[4] == pytest.approx(0.010, rel=1e-3) and 0.0 < loose[2] < 0.003
