@@ -147,7 +147,7 @@ def on_gpu(options: Options) -> Iterator[Quantity]:
         more, vertices = extra_time(SKIRT, options, 256, cloth={"solver": solver})
         yield Quantity(f"256 skirts of {vertices} vertices, on top of Reach, {solver}", more, "%", None, 1000.0, "<=")
     options = replace(options, fidelity="fine")
-    steps = Dressed([SHIRT | {"edge": 2.0 * FINE}], options, motion="step", cloth=SOLVER).step(5)
+    steps = Dressed([SHIRT | {"edge": 1.8 * FINE}], options, motion="step", cloth=SOLVER).step(5)
     start = time.perf_counter()
     steps.step(25)
     took = (time.perf_counter() - start) / 25

@@ -21,6 +21,7 @@ from piavatar_envs.avatar.body.asset import vertex_normals
 from piavatar_envs.avatar.body.outfit import cut_triangles
 from piavatar_envs.cloth.pattern import ROW
 from piavatar_envs.cloth.remesh import boundary_loops, remesh
+from piavatar_envs.cloth.subdivision import levels_for, subdivided
 from piavatar_envs.cloth.wearer import Wearer
 
 #: Ways outwards [m], shape ``(W, 3)``, of a piece's points with normals, and its shares of the wearer's vertices.
@@ -32,6 +33,8 @@ _COLLAR, _TILT, _WIDTH = 0.03, 0.45, 0.45
 _SHARES = 0.63, -0.65
 #: Passes along the coarse mesh, which make its edges even.
 _EVENING = 12
+#: Longest edges of a piece of skin, on average, over the wanted length: cloth has some of the piece's vertices.
+_FINEST = 0.9
 #: Fewest vertices of a piece of skin.
 _FEWEST = 20
 #: Length of a border over the height of the wearer, below which it is a hole and no hem.
@@ -139,10 +142,14 @@ def lay_out(wearer: Wearer, field: np.ndarray, ease: Ease, gap: float, edge: flo
     if len(used) < _FEWEST or not piece.loops:
         raise ValueError("nothing of the body is inside of the garment's seams, or all of it; change where they are")
     piece = _without_holes(piece, blend @ wearer.vertices, _HOLE * float(np.ptp(wearer.vertices[:, 2])))
+    levels = levels_for(piece.faces, blend @ wearer.vertices, _FINEST * edge, most=4)
+    if levels:
+        fine = subdivided(piece.faces, blend.shape[0], levels, smooth=False)
+        blend, piece = (fine.matrix @ blend).tocsr(), Sheet(fine.faces)
     points = _laid(wearer, blend, piece, ease, gap, smoothing)
     area = 0.5 * np.linalg.norm(np.cross(*_sides(points, piece.faces)), axis=1).sum()
     least = sum(max(3, round(_around(points[loop]) / edge)) for loop in piece.loops)
-    count = min(max(int(area / (ROW * edge**2)), least + 4, 12), len(used))
+    count = min(max(int(area / (ROW * edge**2)), least + 4, 12), blend.shape[0])
     found = remesh(points, piece.faces, count, first=piece.loops, spacing=edge)
     faces = _without_notches(found.faces, piece.rim[found.keep])
     panel = Panel(blend, piece, found.keep, Sheet(flipped(points[found.keep], faces)))

@@ -1,9 +1,9 @@
 """Garments as they are drawn: smooth between the vertices of their cloth, with two sides and a hem.
 
-A garment's mesh is divided until folds look round (:mod:`.subdivision`). Clothes of a character's file that have
-textures keep their own triangles, which the divided mesh moves. Every point of it is drawn twice, half of the
-cloth's drawn thickness out and in along the normal, and borders are closed, so that each side has its own colour and
-light, and programs that read films find a closed surface.
+A garment's mesh is divided until folds look round (:mod:`piavatar_envs.cloth.subdivision`). Clothes of a character's
+file that have textures keep their own triangles, which the divided mesh moves. Every point of it is drawn twice, half
+of the cloth's drawn thickness out and in along the normal, and borders are closed, so that each side has its own
+colour and light, and programs that read films find a closed surface.
 
 Symbols in kernels: ``i`` picture, ``e = envs[i]`` its environment, ``v`` vertex of cloth, ``w`` point of the finer one.
 """
@@ -21,9 +21,9 @@ from scipy import sparse
 from piavatar_envs.avatar.body.asset import AvatarAsset, vertex_normals
 from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.avatar.body.textures import Textures
+from piavatar_envs.cloth.subdivision import Subdivision, levels_for, subdivided
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import fill
-from piavatar_envs.render.subdivision import Subdivision, levels_for, subdivided
 from piavatar_envs.render.wearing import layering
 
 if TYPE_CHECKING:

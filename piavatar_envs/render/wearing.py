@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from piavatar_envs.avatar.body.asset import AvatarAsset, Look, dense_weights, vertex_normals
 from piavatar_envs.avatar.body.outfit import dressed
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.render.subdivision import levels_for, subdivided
+from piavatar_envs.cloth.subdivision import levels_for, subdivided
 from piavatar_envs.sim.bodies import Flesh
 
 if TYPE_CHECKING:

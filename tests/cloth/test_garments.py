@@ -107,6 +107,15 @@ def test_a_cut_fits_other_shapes_with_the_same_vertices(kind, wearers):
     assert (other.surface.distance(placed) > 0.0).mean() > 0.9
 
 
+@pytest.mark.parametrize("kind", ["shirt", "trousers"])
+def test_edges_are_as_short_as_asked_for(wearers, kind):
+    """The skin's own edges are 19 and 26 mm long."""
+    cut = cut_garment(kind, wearers["mean"], {"edge": 0.014})
+    corners = cut.positions[cut.faces]
+    length = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    assert 0.9 < length.mean() / 0.014 < 1.1
+
+
 @pytest.mark.parametrize(("sleeve", "borders"), [(0.0, 4), (0.6, 4), (1.9, 4)])
 def test_sleeves_end_where_they_should(wearers, sleeve, borders):
     wearer = wearers["mean"]
