@@ -304,8 +304,9 @@ def check_finite(
     """
     named = [(f"{name}.{own}", tensor) for name, part in modules.items() for own, tensor in part.named_parameters()]
     named += outputs.items()
+    device = named[0][1].device  # outputs may be on the host, networks not
     # one answer of all, for which a GPU is waited for once
-    if torch.stack([tensor.isfinite().all() for _, tensor in named]).all():
+    if torch.stack([tensor.isfinite().all().to(device) for _, tensor in named]).all():
         return
     name, tensor = next((name, tensor) for name, tensor in named if not tensor.isfinite().all())
     place = (~tensor.isfinite()).nonzero()[0].tolist()

@@ -20,6 +20,8 @@ from piavatar_envs.config import ConfigError
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.observations import ObservationLayout
 
+MOST_THREADS = 8  # of torch, beside environments on a GPU
+
 
 @dataclass(frozen=True)
 class EnvFactory:
@@ -125,8 +127,8 @@ def start_vector(config: TrainingConfig, device: str = "cpu") -> VecEnv:
     Raises:
         ValueError: an unknown device, or a batch that does not fit.
     """
-    if device == "cpu":
-        torch.set_num_threads(1)  # the environments have the cores; the networks are small
+    # a CPU's cores are for the environments; beside a GPU's, many threads on small networks mostly wait for each other
+    torch.set_num_threads(1 if device == "cpu" else min(torch.get_num_threads(), MOST_THREADS))
     return SB3VecEnv(config.env_id, config.num_workers, device=device, config=dict(config.env))
 
 
