@@ -403,12 +403,14 @@ class TorchArrays:
     def begin(self) -> None:
         """Let Warp's stream wait for torch's, without the host."""
         if self._device.is_cuda:
-            self._device.stream.wait_stream(self._torch_stream())
+            with wp.ScopedDevice(self._device):  # torch's default stream has the same handle on every GPU
+                self._device.stream.wait_stream(self._torch_stream())
 
     def end(self) -> None:
         """Let torch's stream wait for Warp's, without the host."""
         if self._device.is_cuda:
-            self._torch_stream().wait_stream(self._device.stream)
+            with wp.ScopedDevice(self._device):
+                self._torch_stream().wait_stream(self._device.stream)
 
     def _torch_stream(self) -> wp.Stream:
         """Return torch's current stream, which callers may change, as a stream of Warp."""

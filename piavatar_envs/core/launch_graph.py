@@ -96,7 +96,6 @@ class LaunchGraph:
         self._launches: list[Launch | PairSort] = []
         self._recorded: list[Callable[[], None]] = []  # bound launches, the first of these
         self._graph: Any = None
-        self._streams: list[wp.Stream] = []  # shared by all parallel sections
 
     def launch(
         self,
@@ -264,7 +263,7 @@ class LaunchGraph:
     def _launch_section(self, launches: list[tuple[Launch | PairSort, Callable[[], None]]]) -> None:
         """Launch parallel branches, on a GPU on streams of their own, the last one on the graph's stream."""
         branches = [list(each) for _, each in groupby(launches, key=lambda pair: pair[0].branch)]
-        own = self._streams_for(len(branches) - 1)
+        own = _branch_streams(self.device, len(branches) - 1)
         for stream in own:
             stream.wait_stream(self.device.stream)
         for branch, stream in zip_longest(branches, own):  # no stream is left for the last one: it has the graph's
@@ -274,11 +273,18 @@ class LaunchGraph:
         for stream in own:
             self.device.stream.wait_stream(stream)
 
-    def _streams_for(self, count: int) -> list[wp.Stream]:
-        """Return ``count`` streams; none on a CPU."""
-        while self.device.is_cuda and len(self._streams) < count:
-            self._streams.append(wp.Stream(self.device))
-        return self._streams[:count]
+
+#: Streams on which parallel branches are captured, by alias of the device. They live as long as the process, because
+#: Warp's list of streams has no lock: a thread that destroys one can make another thread's capture fail.
+_STREAMS: dict[str, list[wp.Stream]] = {}
+
+
+def _branch_streams(device: wp.Device, count: int) -> list[wp.Stream]:
+    """Return ``count`` streams that all graphs of a device share; none on a CPU."""
+    streams = _STREAMS.setdefault(device.alias, [])
+    while device.is_cuda and len(streams) < count:
+        streams.append(wp.Stream(device))
+    return streams[:count]
 
 
 def acquire(device: wp.Device) -> wp.Stream | None:
