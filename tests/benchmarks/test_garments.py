@@ -58,6 +58,7 @@ def test_theory():
 
 def test_a_dressed_body_is_measured(device):
     """Run a row with a body: what the cloth gives it is what it receives."""
+    pytest.importorskip("pybullet_data", reason="needs the extra motions: the body walks in a DeepMimic clip")
     rows = list(CHECKS["momentum"].measure(Options(fidelity="tiny", device=device)))
     assert [row.verdict for row in rows] == ["holds", "holds"]
     walking = worn.Dressed([worn.SKIRT], Options(fidelity="tiny", device=device), motion="deepmimic:walk", loop=True)

@@ -49,7 +49,7 @@ def check_rest(garment: Garment, wearer: Wearer) -> None:
     strain = garment.mesh.strain(garment.draped)
     assert np.sqrt((strain**2).mean()) < 0.02
     cloth = Cloth([garment], still(wearer, proxy_of(wearer.asset)), control_dt=1.0 / 30.0)
-    graph, failure = LaunchGraph("cpu"), wp.zeros(1, dtype=int)
+    graph, failure = LaunchGraph("cpu"), wp.zeros(1, dtype=int, device="cpu")
     cloth.record_step(graph, failure)
     for _ in range(20):
         graph.run()

@@ -44,7 +44,7 @@ def test_commanded_motion_loads_no_spring_and_strains_nothing(make_batch, gravit
     batch = make_batch(REACH, 1, **control(), **EMPTY | {"gravity": gravity}, fidelity="coarse")
     batch.reset(seeds=[0])
     for now in run(batch, 16):
-        assert now.displacement().max() < 1e-5  # [m]
+        assert now.displacement().max() < 2e-5  # [m], single precision of places a metre from the origin
         assert np.degrees(np.abs(now.errors).max()) < 0.005
         assert np.abs(deviation(batch)).max() < 2e-3
     assert now.strain().mean() < 1e-4
