@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 import tyro
 from tqdm import tqdm
 
-from agents.files import describe_run, plain, write_json
+from agents.files import ROOT, describe_run, plain, write_json
 from piavatar_envs.cli import print_any_text
 
 Item = TypeVar("Item")
@@ -47,6 +47,11 @@ class Options:
 def progress(items: Iterable[Item], description: str, total: int | None = None) -> Iterable[Item]:
     """Wrap ``items`` in a progress bar on stderr; silent where stderr is not a terminal."""
     return tqdm(items, desc=description, total=total, disable=None, dynamic_ncols=True)
+
+
+def relative(value: Any) -> Any:
+    """Return a path inside of the checkout relative to it, so that results name no machine's folders."""
+    return value.relative_to(ROOT) if isinstance(value, Path) and value.is_relative_to(ROOT) else value
 
 
 def main(
@@ -68,7 +73,7 @@ def main(
     program = spec.name if spec and spec.name.startswith("benchmarks.") else f"benchmarks.{benchmark}"
     chosen = tyro.cli(options, prog=f"python -m {program}", args=args)
     report = describe_run(benchmark, chosen.device)
-    settings = {key: value for key, value in asdict(chosen).items() if key not in ("out", "device")}
+    settings = {key: relative(value) for key, value in asdict(chosen).items() if key not in ("out", "device")}
     report |= {"options": plain(settings, "options"), "complete": False, "results": []}
     for row in cases(chosen):
         if "case" not in row:
