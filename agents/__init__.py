@@ -8,6 +8,9 @@ from __future__ import annotations
 import sys
 from types import TracebackType
 
+#: Extras with all that the scripts of a folder need, where it is not ``train``.
+_EXTRAS = {"datasets": "datasets", "fit": "fit", "rllib": "train,multi", "rsl_rl": "rsl", "skrl": "skrl"}
+
 
 def _in_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """Report what ended a script."""
@@ -25,12 +28,11 @@ def _in_one_line(kind: type[BaseException], error: BaseException, trace: Traceba
 def _remedy(module: str) -> str:
     """Return what a script needs, and the command that installs it."""
     try:
-        from piavatar_envs.core.extras import extras_of, missing
+        from piavatar_envs.core.extras import extra_of, missing
     except ImportError:  # a module that the package itself needs
         return f'this script needs {module}, which is not installed; in the checkout: pip install -e ".[train]"'
     library = next((word.split(".")[1] for word in sys.orig_argv if word.startswith("agents.")), "")
-    own = {"rsl_rl": ("rsl",), "skrl": ("skrl", "multi")}.get(library, ())
-    return str(missing("this script", module, extras_of(module, *own)))
+    return str(missing("this script", module, _EXTRAS.get(library) or extra_of(module)))
 
 
 if sys.argv[:1] == ["-m"]:  # while Python looks for the module that it runs as a script

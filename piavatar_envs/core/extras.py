@@ -9,15 +9,15 @@ from pathlib import Path
 #: Modules by extra; an extra is present if all of its modules are.
 EXTRAS = {
     "render": ("imageio", "imageio_ffmpeg", "PIL"),
-    "fit": ("optuna",),
-    "vlm": ("transformers",),
-    "datasets": ("minari", "h5py", "torchrl"),
     "train": ("stable_baselines3", "torch", "matplotlib", "tensorboard"),
+    "fit": ("optuna", "stable_baselines3", "torch", "matplotlib"),
+    "vlm": ("transformers",),
+    "datasets": ("minari", "h5py", "stable_baselines3", "torch", "torchrl"),
     "motions": ("pybullet_data",),
     "props": ("trimesh",),
     "multi": ("pettingzoo",),
-    "skrl": ("skrl", "torch"),
-    "rsl": ("rsl_rl", "tensordict", "torch"),
+    "skrl": ("skrl", "stable_baselines3", "torch", "matplotlib", "pettingzoo"),
+    "rsl": ("rsl_rl", "tensordict", "stable_baselines3", "torch", "matplotlib"),
     "live": ("viser",),
     "splats": ("gsply",),
     "usd": ("pxr",),
@@ -43,10 +43,9 @@ def install_command(extra: str) -> str:
     return f'pip install "piavatar-envs[{extra}]{source}"'
 
 
-def extras_of(module: str, *more: str) -> str:
-    """Return the extras that install a module, and ``more`` ones, as an argument of :func:`install_command`."""
-    first = next((extra for extra, modules in EXTRAS.items() if module in modules), "train")
-    return ",".join(dict.fromkeys((first, *more)))
+def extra_of(module: str) -> str:
+    """Return the first extra that installs a module."""
+    return next((extra for extra, modules in EXTRAS.items() if module in modules), "train")
 
 
 class MissingExtra(ImportError):

@@ -147,7 +147,7 @@ def test_a_script_without_torch_names_the_extra_in_one_line(script, tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300)
     assert done.returncode == 1 and done.stdout == ""
     (line,) = done.stderr.strip().splitlines()
-    extras = {"rsl_rl.train": "[train,rsl]", "skrl.train": "[train,skrl,multi]"}.get(script, "[train]")
+    extras = {"rsl_rl.train": "[rsl]", "skrl.train": "[skrl]"}.get(script, "[train]")
     assert line.startswith("error: this script needs ") and extras in line
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("sitecustomize.py", "__pycache__")] == []
 
