@@ -8,10 +8,14 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gymnasium.envs.registration import register, registry
+from piavatar_envs.core.command_start import report_interrupts
 
-from piavatar_envs.tasks import add_task, id_of, place_of, task_modules
-from piavatar_envs.tasks.games import game_modules
+report_interrupts()  # before the imports, which take longest
+
+from gymnasium.envs.registration import register, registry  # noqa: E402
+
+from piavatar_envs.tasks import add_task, id_of, place_of, task_modules  # noqa: E402
+from piavatar_envs.tasks.games import game_modules  # noqa: E402
 
 if TYPE_CHECKING:
     from piavatar_envs.api.conformance import check_task

@@ -8,8 +8,8 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import os
 import re
-import shlex
 import sys
 from collections.abc import Container
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from piavatar_envs.config import BodyColor
+from piavatar_envs.core.command_start import again
 from piavatar_envs.tasks import NAMESPACE, instead_of, listed_name
 
 EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")]
@@ -318,13 +319,17 @@ def main(args: list[str] | None = None) -> None:
             description="Soft human avatars behind reset/step. --version prints the version.",
             args=args,
         )
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of a pipe, such as head, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
     except (ValueError, ImportError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt as stop:
-        again = shlex.join(["python", "-m", "piavatar_envs", *(sys.argv[1:] if args is None else args)])
         reached = str(stop) or "before the first step"
-        print(f"\ninterrupted {reached}; begin again with {again}", file=sys.stderr)
+        command = again(list(sys.argv[1:] if args is None else args))
+        print(f"\ninterrupted {reached}; begin again with {command}", file=sys.stderr)
         raise SystemExit(130) from None
     except SystemExit as stop:  # the parser has printed its complaint
         if stop.code == 2:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -231,3 +232,31 @@ def test_games_are_played(name):
     assert {"agent_0.success", "agent_1.reward_control"} <= set(rollout.metrics)
     with pytest.raises(ValueError, match=r"'sumo_v9'.*sumo_v0"):
         play.play("sumo_v9", steps=1)
+
+
+@pytest.mark.parametrize("module", ["gymnasium", "tyro", "warp"])
+@pytest.mark.parametrize("start", ["-m", "script"])
+def test_ctrl_c_during_the_imports_ends_in_one_line(module, start, tmp_path):
+    (tmp_path / "sitecustomize.py").write_text(
+        "import sys\n"
+        "class Interrupting:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {module!r}:\n"
+        "            raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupting())\n"
+    )
+    script = tmp_path / "piavatar-envs"
+    script.write_text("from piavatar_envs.cli import main\nmain()\n")
+    env = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(cli.__file__).parents[1]}"}
+    command = [sys.executable, *(["-m", "piavatar_envs"] if start == "-m" else [str(script)]), "play", "An id"]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode != 0 and done.stdout == ""
+    (line,) = done.stderr.strip().splitlines()
+    assert line == "interrupted before the first step; begin again with python -m piavatar_envs play 'An id'"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes end in another error there")
+def test_a_reader_that_has_had_enough_ends_it_quietly():
+    command = f"{sys.executable} -m piavatar_envs list | head -n 0"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=300)
+    assert done.stdout == done.stderr == ""
