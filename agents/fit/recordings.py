@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from piavatar_envs.config import ConfigError
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import numbers, reading
 
 #: Readings that are positions.
 POSITIONS = ("bone_position", "prop_position", "particle_position")
@@ -27,6 +27,8 @@ OF_STATE = {
     "particles.x": "particle_position",
 }
 MARKERS = "marker_position"
+#: Arrays that are read; others may be there, such as those of a state.
+_READ = (*POSITIONS, MARKERS, "time", "marker_particle")
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ def read_recording(path: Path) -> Recording:
     """
     try:
         with reading(path, "a recording"), np.load(path, allow_pickle=False) as file:
-            found = {OF_STATE.get(name, name): np.asarray(file[name]) for name in file.files}
+            named = {OF_STATE.get(name, name): name for name in file.files}
+            found = {name: numbers(file, named[name]) for name in _READ if name in named}
     except (OSError, ValueError) as error:
         raise ConfigError(f"path={str(path)!r}: {error}") from None
     positions = {}
@@ -81,6 +84,8 @@ def read_recording(path: Path) -> Recording:
     if any(len(array) != count for array in positions.values()):
         lengths = {name: len(array) for name, array in positions.items()}
         raise ConfigError(f"{path}: arrays have different numbers of times: {lengths}")
+    if particles is not None and (particles.dtype.kind not in "iu" or (particles < 0).any()):
+        raise ConfigError(f"{path}: marker_particle must be indices of particles, integers from 0 on")
     if particles is not None and particles.shape != positions.get(MARKERS, np.empty((0, 0))).shape[1:2]:
         raise ConfigError(f"{path}: marker_particle has shape {particles.shape}; use one particle a marker")
     if particles is None and MARKERS in positions and not np.isfinite(positions[MARKERS][0]).all():

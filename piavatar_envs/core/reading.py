@@ -16,6 +16,8 @@ from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 #: Errors of parsers (NumPy, zipfile, json, yaml, torch) on content that is damaged, foreign or too deeply nested.
 UNREADABLE: tuple[type[Exception], ...] = (
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, NameError, OSError, RuntimeError, SyntaxError,
@@ -54,6 +56,22 @@ def check_file(path: Path) -> None:
         raise ValueError(f"{path} is a folder; give the path of a file in it")
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}")
+
+
+def numbers(file: np.lib.npyio.NpzFile, key: str) -> np.ndarray:
+    """Return an array of numbers from an archive.
+
+    NumPy returns the bytes of what is not an array.
+
+    Raises:
+        KeyError: there is no such array.
+        ValueError: it does not hold real numbers.
+    """
+    array = file[key]
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "bfiu":
+        kind = array.dtype if isinstance(array, np.ndarray) else "bytes, none of an array"
+        raise ValueError(f"{key} holds {kind}; save an array of real numbers")
+    return array
 
 
 def first_line(error: Exception) -> str:

@@ -159,6 +159,12 @@ def mesh(path: str | Path, spacing: float, scale: float = 1.0) -> PropPoints:
     _check_lengths(path.name, spacing=spacing, scale=scale)
     shape = _load(path)
     shape.apply_scale(scale)
+    extent = float(np.abs(shape.vertices).max())
+    if not extent < float(np.finfo(np.float32).max):
+        raise ValueError(
+            f"{path.name} has a vertex {extent:.3g} m from its origin, which is no number in single precision; export "
+            "it again, or use a smaller size"
+        )
     parts = _orient_parts(shape)
     if not shape.volume > 0.0:
         raise ValueError(f"{path.name} encloses no volume; export a solid, not a sheet")

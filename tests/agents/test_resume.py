@@ -17,7 +17,7 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents.checkpoint import Checkpoint, load_weights
+from agents.checkpoint import FORMAT, Checkpoint, load_weights
 from agents.files import hold, write_atomically
 from agents.sb3 import train
 from agents.sb3.config import load_training
@@ -182,6 +182,10 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_never_run(tiny, tmp_path):
     torch.save({"format": 0}, path)
     with pytest.raises(ConfigError, match=r"has format=0, this reads \d+; delete it"):
         checkpoint_of(tiny, tmp_path)
+    for content in ({}, {"about": {}}, {"about": {"script": "sb3.train"}, "state": {}}, {"about": None, "state": []}):
+        torch.save({"format": FORMAT, **content}, path)
+        with pytest.raises(ConfigError, match="lacks the state or the description of a training run; delete it"):
+            checkpoint_of(tiny, tmp_path)
 
     class Trap:
         def __reduce__(self):

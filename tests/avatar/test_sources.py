@@ -252,6 +252,17 @@ def test_a_source_reads_the_file_that_it_is_given(tmp_path):
     assert load_asset("scaled", str(file)) is load_asset("scaled", str(file))
 
 
+def test_every_refusal_of_a_file_names_it(tmp_path):
+    (tmp_path / "person.dat").touch()
+
+    def refusing(path: str) -> None:
+        raise ValueError("the surface is too thin")
+
+    piavatar_envs.register_source("refusing", refusing)
+    with pytest.raises(ValueError, match=r"person\.dat: the surface is too thin"):
+        load_asset("refusing", tmp_path / "person.dat")
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

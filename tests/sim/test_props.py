@@ -504,6 +504,8 @@ BAD_FILES = {
         lambda trimesh: trimesh.Trimesh(TETRAHEDRON[0][:3], [[0, 1, 2], [0, 2, 1]], process=False),
         r"no volume",
     ),
+    "far.off": (lambda trimesh: trimesh.Trimesh(1e39 * TETRAHEDRON[0], TETRAHEDRON[1]), r"a vertex .*e\+39 m"),
+    "wide.off": (lambda trimesh: trimesh.Trimesh(1e30 * TETRAHEDRON[0], TETRAHEDRON[1]), r"has .* cells"),
     "shell.stl": (hollow_ball, r"spacing=0\.05 m.* spacing under 0\.025 m"),
 }
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs, leg_length, retarget, root_path
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import numbers, reading
 
 #: Width of ``poses`` -> the key that names the frame rate.
 LAYOUTS: dict[int, str] = {156: "mocap_framerate", 165: "mocap_frame_rate"}
@@ -109,7 +109,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
             missing = {"poses", "trans"} - keys
             if missing:
                 raise ValueError(f"keys {sorted(missing)} are missing, it has {sorted(keys)}")
-            poses, trans = content["poses"], content["trans"]
+            poses, trans = numbers(content, "poses"), numbers(content, "trans")
             rate_key = LAYOUTS.get(poses.shape[-1] if poses.ndim == 2 else 0)
             if rate_key is None:
                 raise ValueError(f"poses has shape {poses.shape}, expected (N, 156) for SMPL-H or (N, 165) for SMPL-X")
@@ -117,7 +117,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
             rate_key = rate_key if rate_key in keys else next((k for k in LAYOUTS.values() if k in keys), None)
             if rate_key is None:
                 raise ValueError(f"the rate is missing: neither of {sorted(LAYOUTS.values())} is in {sorted(keys)}")
-            rate = content[rate_key]
+            rate = numbers(content, rate_key)
     return _checked(path, poses, trans, rate)
 
 

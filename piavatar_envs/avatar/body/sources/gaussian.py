@@ -29,7 +29,7 @@ from piavatar_envs.avatar.body.splat_registration import (
     register_splats,
 )
 from piavatar_envs.avatar.body.splats import SkinnedSplats, SplatCloud, mean_colors
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import numbers, reading
 from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Endings of files that only this source reads.
@@ -198,7 +198,7 @@ def _read_weights(path: Path, count: int) -> np.ndarray:
         if promised > 8 * count * max(MODELS) + (1 << 16):
             raise ValueError(f"it unpacks to {promised} bytes, more than the weights of {count} splats")
         with np.load(path, allow_pickle=False) as file:
-            weights = np.asarray(file["weights"], np.float64)
+            weights = numbers(file, "weights").astype(np.float64)
         joints = weights.shape[1] if weights.ndim == 2 else 0
         if joints not in (NUM_JOINTS, *MODELS) or len(weights) != count:
             known = ", ".join(map(str, (NUM_JOINTS, *MODELS)))
