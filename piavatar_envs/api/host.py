@@ -143,10 +143,13 @@ class EpisodeHost:
         count = model.num_substeps
         if count > MANY_SUBSTEPS:
             seconds = SUBSTEP_TIME * count * model.num_particles
+            name, stiffness = batch.simulation.subjects.stiffest()
+            cause = f"the stiffest matter is that of {name!r} (young_modulus={stiffness:.3g} Pa)"
+            if physics.num_substeps is not None:
+                cause = f"physics.num_substeps={physics.num_substeps} is set"
             gym.logger.warn(
-                f"a control step takes {count} substeps, about {seconds:.1g} s on a free CPU core, with "
-                f"physics.young_modulus={physics.young_modulus:g} Pa and fidelity={physics.fidelity!r}; softer or "
-                "slower matter, or a coarser fidelity, needs fewer"
+                f"a control step takes {count} substeps, about {seconds:.1g} s on a free CPU core: {cause}, and "
+                f"fidelity={physics.fidelity!r}; softer or slower matter, or a coarser fidelity, needs fewer"
             )
 
     @property

@@ -31,6 +31,9 @@ def init_warp() -> None:
     Raises:
         KernelCacheError: the folder cannot be created.
     """
+    for name in ("WARP_CACHE_PATH", "XDG_CACHE_HOME"):
+        if os.environ.get(name) == "":  # which is not set, and to Warp the working directory
+            del os.environ[name]
     if wp.config.log_level == wp.LOG_INFO:  # its default: a banner, and a line a module in every process
         wp.config.log_level = wp.LOG_WARNING
     try:
@@ -44,11 +47,12 @@ def init_warp() -> None:
 def _without_driver_warning() -> Iterator[None]:
     """Hold back Warp's warning of a missing CUDA driver, which it writes in every process of a machine without GPU."""
     try:
+        held = tempfile.TemporaryFile()  # noqa: SIM115 - its errors are not those of the block
         before = os.dup(2)  # native code writes there, whatever sys.stderr is
-    except OSError:
+    except OSError:  # no folder for temporary files can be written, or there is no standard error
         yield
         return
-    with tempfile.TemporaryFile() as held:
+    with held:
         os.dup2(held.fileno(), 2)
         try:
             yield

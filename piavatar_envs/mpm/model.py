@@ -182,6 +182,12 @@ class MaterialPoints:
         """Return the speed of the fastest elastic wave, ``sqrt((lam + 2 mu) / rho)`` [m/s]."""
         return float(self._sound_speeds().max())
 
+    def fastest(self) -> tuple[int, float]:
+        """Return the particle in which elastic waves are fastest, and its Young's modulus [Pa]."""
+        speeds = self._sound_speeds()
+        row, particle = np.unravel_index(speeds.argmax(), speeds.shape)
+        return int(particle), float(np.broadcast_to(self.young_modulus, speeds.shape)[row, particle])
+
     def limiting_speed(self, dx: float, factor: float = 1.0) -> float:
         """Return the speed of the elastic wave whose limit of the time step is that of viscous matter [m/s].
 

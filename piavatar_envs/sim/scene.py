@@ -94,6 +94,11 @@ class Subjects:
     colliders: tuple[Collider, ...]
     collider_names: tuple[str, ...]
 
+    def stiffest(self) -> tuple[str, float]:
+        """Return the name of the subject in which elastic waves are fastest, and its Young's modulus there [Pa]."""
+        particle, young_modulus = self.matter.fastest()
+        return self.names[int(np.searchsorted(self.first, particle, side="right")) - 1], young_modulus
+
 
 def assemble(
     scene: SceneConfig,

@@ -120,9 +120,23 @@ def test_threads_build_and_step_environments_at_the_same_time(device, equal):
     assert all(equal(ours, alone) for seed in range(4) for ours, alone in zip(together[seed], play(seed), strict=True))
 
 
-def test_stiffness_that_makes_steps_slow_warns(device):
-    with pytest.warns(UserWarning, match=r"\d{3} substeps, about [\d.]+ s .* physics\.young_modulus=1e\+09 Pa"):
-        AvatarEnv("Reach-v0", device=device, fidelity="tiny", young_modulus=1e9)
+BALL = {"name": "ball", "size": [0.15], "mass": 4, "position": [0, -1.2, 1.1], "young_modulus": 1e9}
+HEAD = {"joints": ["head"], "beyond": 0.04, "young_modulus": 1e9}
+
+
+@pytest.mark.parametrize(
+    ("settings", "cause"),
+    [
+        ({"young_modulus": 1e9}, r"'agent_0' \(young_modulus=1e\+09 Pa\)"),
+        ({"scene": {"props": [BALL]}}, r"'ball' \(young_modulus=1e\+09 Pa\)"),
+        ({"scene": {"avatars": [{"regions": [HEAD]}]}}, r"'agent_0' \(young_modulus=1e\+09 Pa\)"),
+        ({"num_substeps": 400}, r"num_substeps=400 is set"),
+    ],
+    ids=["flesh", "prop", "region", "number"],
+)
+def test_matter_that_makes_steps_slow_warns_with_its_name(device, settings, cause):
+    with pytest.warns(UserWarning, match=rf"\d{{3,}} substeps, about [\d.]+ s .*: .*{cause}"):
+        AvatarEnv("Reach-v0", device=device, fidelity="tiny", **settings)
 
 
 def test_the_spec_gives_the_time_limit_and_calls_can_shorten_it(device):

@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
 
 from piavatar_envs.core.kernel_cache import _without_driver_warning
 from piavatar_envs.core.launch_graph import _shown
@@ -37,3 +41,26 @@ def test_a_bar_shows_only_where_compiling_takes_time(capfd):
             assert len(list(_shown(loads))) == 3
         text = capfd.readouterr().err
         assert ("kernels, compiled once" in text) == shown and text.count("\n") == int(shown)
+
+
+def test_without_a_folder_for_temporary_files_warnings_pass(monkeypatch, capfd):
+    """A container that can only be read has none, though its kernel cache may be a volume."""
+
+    def refuse(**_):
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    with _without_driver_warning():
+        os.write(2, b"something\n")
+    assert capfd.readouterr().err == "something\n"
+
+
+@pytest.mark.parametrize("name", ["WARP_CACHE_PATH", "XDG_CACHE_HOME"])
+def test_an_empty_variable_of_the_cache_is_none(name, tmp_path):
+    """Warp takes it for the working directory."""
+    code = "from piavatar_envs.core.kernel_cache import init_warp\ninit_warp()\n"
+    env = {key: value for key, value in os.environ.items() if key not in ("WARP_CACHE_PATH", "XDG_CACHE_HOME")}
+    env |= {"HOME": str(tmp_path / "home"), name: "", "PYTHONPATH": str(Path(__file__).parents[2])}
+    (tmp_path / "here").mkdir()
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path / "here", env=env, timeout=300, check=True)
+    assert not list((tmp_path / "here").iterdir())
