@@ -259,4 +259,6 @@ def _graded(asset: AvatarAsset, cut: Cut, draped: np.ndarray, wearer: Wearer) ->
 
     mean = fitted(np.zeros(count))
     ends = [np.eye(count)[parameter] * (-1.0, 1.0)[half] for parameter, half in np.ndindex(count, 2)]
-    return np.stack([fitted(end) - mean for end in ends]) if count else np.zeros((0, *draped.shape))
+    # points that each take their nearest way out of the skin jump from one shape to another beside their neighbors
+    changes = [_smoothed(cut.faces, fitted(end) - mean) for end in ends]
+    return np.stack(changes) if count else np.zeros((0, *draped.shape))

@@ -97,6 +97,19 @@ def test_every_kind_fits_bodies_of_any_shape_and_source(kind, wearers):
 
 
 @pytest.mark.parametrize("kind", CUT)
+def test_what_is_held_keeps_the_lengths_of_the_pattern(kind, wearers):
+    """Check edges that no drape can relax."""
+    for name, wearer in wearers.items():
+        cut = cut_garment(kind, wearer, {})
+        edges = edges_of(cut.faces)[1]
+        held = edges[np.isin(edges, cut.held).all(axis=1)]
+        placed = cut.positions.copy()
+        placed[cut.held] = wearer.outside(placed[cut.held], cut.thickness)
+        strain = np.linalg.norm(placed[held[:, 0]] - placed[held[:, 1]], axis=1) / cut.measure(held) - 1.0
+        assert (np.abs(strain) < 0.25).all(), (name, strain.min(), strain.max())
+
+
+@pytest.mark.parametrize("kind", CUT)
 def test_a_cut_fits_other_shapes_with_the_same_vertices(kind, wearers):
     """Check that on the wearer's own shape it is what it was, and outside of another shape."""
     wearer, other = wearers["mean"], wearers["random 1"]

@@ -100,6 +100,18 @@ def test_grading_follows_the_shape(asset, skirt):
         assert np.ptp(band[:, 0]) == pytest.approx(np.ptp(wearer.section(band[:, 2].mean())[:, 0]), abs=0.03)
 
 
+@pytest.mark.parametrize("kind", ["scarf", "dress"])
+def test_grading_keeps_the_pattern_even(asset, kind):
+    """Check that no edge of a graded garment shrinks or grows far more than the body does."""
+    garment, rng = made(asset, kind, grading=True, settings={"edge": 0.04}), np.random.default_rng(0)
+    span = garment.mesh.strain(garment.draped) + 1.0
+    for given in asset.sample_parameters(rng, size=16):
+        halves = np.stack([np.maximum(-given, 0.0), np.maximum(given, 0.0)], axis=1).ravel()
+        placed = garment.draped + np.tensordot(halves, garment.shape_deltas, axes=1)
+        ratio = (garment.mesh.strain(placed) + 1.0) / span
+        assert ratio.min() > 0.6 and ratio.max() < 1.6, (ratio.min(), ratio.max())
+
+
 def test_outer_garments_lie_over_inner_ones(asset):
     inner, outer = (made(asset, "skirt", layer=layer) for layer in (0, 1))
     assert outer.thickness == pytest.approx(inner.thickness + LAYER)

@@ -23,6 +23,10 @@ _LENGTH, _HELD = 0.95, 0.03
 #: scarf's width.
 _BESIDE, _CHEST, _NEAR, _SHIFT = 0.5, 0.09, 0.02, 0.1
 _SAMPLES = 600
+#: Times that what is held is pushed out of the skin, by what the deepest vertex lacks.
+_PUSHES = 6
+#: Direction out of the nape.
+_BACK = np.array([0.0, 1.0, 0.2])
 
 
 def cut(
@@ -48,15 +52,18 @@ def cut(
         raise ValueError(f"length={length:.3g} of the garment 'scarf' must be at most {most:.3g} [m]")
     along, across, faces = _rectangle(length, width, edge)
 
+    held = np.flatnonzero((np.abs(along) < _HELD) & (np.abs(across) < _HELD)).astype(np.int32)
+
     def fit(other: Wearer) -> np.ndarray:
-        return other.outside(_placed(other, along, across), THICKNESS)
+        positions = other.outside(_placed(other, along, across), THICKNESS)
+        positions[held] = _laid_flat(other, along[held], across[held] - _SHIFT * np.ptp(across))
+        return positions
 
     def lengths(pairs: np.ndarray) -> np.ndarray:
         first, second = pairs.T
         return np.hypot(along[first] - along[second], across[first] - across[second])
 
     sees = np.full(len(along), TRUNK | HEAD | LEFT_LEG | RIGHT_LEG | LEFT_FOOT | RIGHT_FOOT, np.int32)
-    held = np.flatnonzero((np.abs(along) < _HELD) & (np.abs(across) < _HELD)).astype(np.int32)
     return Cut(fit(wearer), faces, sees, held, lengths, fit, THICKNESS)
 
 
@@ -81,22 +88,21 @@ def _placed(wearer: Wearer, along: np.ndarray, across: np.ndarray) -> np.ndarray
     The middle line goes from the nape over the shoulder beside the neck and falls along the chest; on the way the cloth
     turns from standing at the nape to lying on the shoulder, which needs no stretch.
     """
-    neck, size = wearer.at("neck"), float(np.ptp(wearer.vertices[:, 2]))
+    neck, nape, size = wearer.at("neck"), _nape(wearer), float(np.ptp(wearer.vertices[:, 2]))
     beside, chest = _BESIDE * wearer.at("left_shoulder")[0], neck[2] - _CHEST * size
-    nape = _farthest(wearer, (0.0, neck[2]), (0, 2), 1, size)
     top = _farthest(wearer, (beside, neck[1]), (0, 1), 2, size)
     upper, lower = (-_farthest(wearer, (beside, z), (0, 2), -1, size) for z in (0.5 * (neck[2] + chest), chest))
     out = min(upper, lower) - _EASE
     points = np.array(
         [
-            [0.0, nape + _EASE, neck[2]],
+            nape,
             [beside, neck[1], top + _EASE],
             [beside, upper - _EASE, 0.5 * (neck[2] + chest)],
             [beside, out, chest],
             [beside, out, chest - along.max()],
         ]
     )
-    normals = np.array([[0.0, 1.0, 0.2], [0.3, 0.0, 1.0], [0.1, -1.0, 0.3], [0.0, -1.0, 0.0], [0.0, -1.0, 0.0]])
+    normals = np.array([_BACK, [0.3, 0.0, 1.0], [0.1, -1.0, 0.3], [0.0, -1.0, 0.0], [0.0, -1.0, 0.0]])
     place = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     steps = np.linspace(0.0, place[-1], _SAMPLES)
     line, outward = PchipInterpolator(place, points)(steps), PchipInterpolator(place, normals)(steps)
@@ -107,6 +113,26 @@ def _placed(wearer: Wearer, along: np.ndarray, across: np.ndarray) -> np.ndarray
     positions = point + (across - _SHIFT * np.ptp(across))[:, None] * up
     positions[:, 0] = np.where(along < 0.0, -positions[:, 0], positions[:, 0])
     return positions
+
+
+def _laid_flat(wearer: Wearer, along: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Return places of a part of the rectangle that lies flat against the nape [m], shape ``(H, 3)``.
+
+    What the body holds does not relax in the drape: vertices that each took their nearest way out of the skin would
+    keep the stretch.
+    """
+    outward = _BACK / np.linalg.norm(_BACK)
+    sideways = np.array([1.0, 0.0, 0.0])
+    places = _nape(wearer) + np.outer(along, sideways) + np.outer(across, np.cross(sideways, outward))
+    for _ in range(_PUSHES):
+        places += max(0.0, THICKNESS - float(wearer.surface.distance(places).min())) * outward
+    return places
+
+
+def _nape(wearer: Wearer) -> np.ndarray:
+    """Return the place of the middle of a scarf behind the neck [m], shape ``(3,)``."""
+    height, size = wearer.at("neck")[2], float(np.ptp(wearer.vertices[:, 2]))
+    return np.array([0.0, _farthest(wearer, (0.0, height), (0, 2), 1, size) + _EASE, height])
 
 
 def _farthest(wearer: Wearer, place: tuple[float, float], axes: tuple[int, int], direction: int, size: float) -> float:
