@@ -118,6 +118,7 @@ def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
         return DummyVecEnv([make])
     methods = multiprocessing.get_all_start_methods()  # never fork: a copy of a running Warp is not a working one
     method = "forkserver" if "forkserver" in methods else "spawn"
+    multiprocessing.set_forkserver_preload([__name__])  # once, and not in each worker
     return SubprocVecEnv([InWorker(make)] * num_workers, start_method=method)
 
 

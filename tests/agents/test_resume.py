@@ -90,6 +90,7 @@ def test_every_way_of_training_goes_on_bit_for_bit(settings, device, tmp_path):
             venv = start_vector(config)
         elif kills:
             venv = start_workers(make, config.num_workers)
+            check_where_they_come_from(venv.processes)
         else:  # one process does what several do
             venv = DummyVecEnv([make] * config.num_workers)
         for steps in kills:
@@ -105,6 +106,13 @@ def test_every_way_of_training_goes_on_bit_for_bit(settings, device, tmp_path):
     whole, parts = (flat(state) for state in states)
     assert whole.keys() == parts.keys() and len(whole) > 800
     assert [name for name in whole if parts[name] != whole[name] and not seconds.search(name)] == []
+
+
+def check_where_they_come_from(workers):
+    """Check that processes are forked from one that has imported torch, which takes longer than they do to start."""
+    if Path("/proc/self/maps").is_file():
+        (parent,) = {Path(f"/proc/{own.pid}/stat").read_text().rpartition(")")[2].split()[1] for own in workers}
+        assert "torch_python" in Path(f"/proc/{parent}/maps").read_text()
 
 
 def learn_on(config, venv, facts, folder: Path, watchers=()):
