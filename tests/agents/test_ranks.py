@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -42,31 +44,28 @@ SKRL = (
 BOTH = [Ranks(0, 2, 0, 2), Ranks(1, 2, 1, 2)]
 
 
-def torchrun(folder: Path, *args: str, launcher: tuple[str, ...]) -> subprocess.Popen:
-    """Start ranks; the output goes to a file in the folder."""
-    command = [sys.executable, "-m", "torch.distributed.run", *launcher, "-m", "tests.agents.rank_probe", str(folder)]
-    with (folder / "log").open("ab") as log:
-        env = os.environ | {"OMP_NUM_THREADS": "1"}
-        return subprocess.Popen([*command, *args], cwd=ROOT, env=env, stdout=log, stderr=log)
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """Runs on two machines, here two torchruns of a rank each: one that fails and is restarted, the same without that,
     and one that is interrupted."""
+    if not hasattr(os, "fork"):
+        pytest.skip("Windows cannot fork ranks")
     folder = tmp_path_factory.mktemp("ranks")
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
     machine = ("--nnodes=2", "--nproc-per-node=1", "--max-restarts=1", "--rdzv-backend=c10d")
     args = ("rsl_rl", "fails", *RSL, "--", "rsl_rl", "whole", *RSL, "--", "skrl", "interrupts", *SKRL)
-    endpoint = f"--rdzv-endpoint=localhost:{port}"
-    started = [torchrun(folder, *args, launcher=(*machine, endpoint)) for _ in range(2)]
+    command = [sys.executable, "-m", "tests.agents.rank_launch", *machine, f"--rdzv-endpoint=localhost:{port}"]
+    command += ["tests/agents/rank_probe.py", str(folder), *args]
+    with (folder / "log").open("ab") as log:
+        env = os.environ | {"OMP_NUM_THREADS": "1"}
+        started = subprocess.Popen(command, cwd=ROOT, env=env, stdout=log, stderr=log, start_new_session=True)
     try:
-        assert all(training.wait(500) for training in started), "the interrupted one is the last"
+        assert started.wait(500), "the interrupted one is the last"
     finally:
-        for training in started:
-            training.terminate()
+        with contextlib.suppress(ProcessLookupError):  # all have ended
+            os.killpg(started.pid, signal.SIGTERM)
     return folder
 
 
