@@ -41,7 +41,8 @@ $(STAMP): pyproject.toml constraints.txt
 demo: install
 	$(BIN)/python -m agents.demo
 
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+# Bytecode is kept, also where the environment forbids it: each process of a test would compile the package anew.
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 # GPU paths that CI can only reach emulated (tests/gpu_on_cpu). The files of mpm take some minutes of one
 # core from an empty cache, mostly to compile.
 OF_A_GPU := tests/core/test_launch_graph.py $(addprefix tests/mpm/test_,p2g_paths.py retention.py::test_paths_agree_and_repeat_bit_for_bit failures.py::test_failed_environment_is_frozen seams.py::test_halves_are_one_bar_on_every_path contact_sensors.py::test_penetration_of_bodies_that_go_on) tests/envs/test_peaks.py tests/cloth/test_batch.py tests/sim/test_forces.py::test_a_force_gives_its_momentum_and_its_angular_momentum $(addprefix tests/avatar/test_,pose_control_batch.py torque_control.py bone_contact.py)
