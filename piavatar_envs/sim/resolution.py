@@ -55,15 +55,15 @@ def check_sizes(
     for collider in colliders:
         what, extents = f"collider {collider.name!r}", _extents(collider)
         _, pole, ball = extents
+        if ball < SWALLOWED * dx:  # first, because its remedy is also that of a pole
+            _refuse(what, ball, SWALLOWED * dx, "of 1.2 grid spacings, so that matter would swallow it", fidelity)
         if fidelity == THIN_LIMBS and pole < spacing_for(dx):
             reason = "that particles are apart, so that limbs would pass it at this fidelity"
             _refuse(what, pole, spacing_for(dx), reason, fidelity)
-        if ball < SWALLOWED * dx:
-            _refuse(what, ball, SWALLOWED * dx, "of 1.2 grid spacings, so that matter would swallow it", fidelity)
         for extent, cells, struck in reversed([*zip(extents, PARTING, ("its edge", "it", "it"), strict=True)]):
             if extent < cells * dx:
                 warnings.warn(
-                    f"{what} is {extent:.2g} m thick, less than {cells * dx:.2g} m: soft bodies that strike {struck} "
+                    f"{what} is {extent:.3g} m thick, less than {cells * dx:.3g} m: soft bodies that strike {struck} "
                     f"fast are dented too deeply, as far as the core of a prop or the bones, and rebound too slowly; "
                     f"{_remedy(extent, cells * dx, fidelity)}",
                     stacklevel=2,
@@ -106,5 +106,5 @@ def _refuse(what: str, extent: float, least: float, reason: str, fidelity: str) 
         ConfigError: always.
     """
     raise ConfigError(
-        f"{what} is {extent:.2g} m thick, less than the {least:.2g} m {reason}; {_remedy(extent, least, fidelity)}"
+        f"{what} is {extent:.3g} m thick, less than the {least:.3g} m {reason}; {_remedy(extent, least, fidelity)}"
     )

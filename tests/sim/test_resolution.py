@@ -42,23 +42,28 @@ def check(fidelity, collider=None, points: PropPoints | None = None):
     check_sizes(HEIGHT / GRID_PER_HEIGHT[fidelity], fidelity, colliders, props)
 
 
-def remedies(error) -> tuple[float, str]:
-    """Return the thickness [m] and the resolution that a message suggests."""
-    thickness, fidelity = re.search(r"make it (\S+) m thick, or set fidelity='(\w+)'", str(error)).groups()
+def remedies(error) -> tuple[float, str | None]:
+    """Return the thickness [m] and, if there is one, the resolution that a message suggests."""
+    thickness, fidelity = re.search(r"make it (\S+) m thick(?:, or set fidelity='(\w+)')?$", str(error)).groups()
     return float(thickness), fidelity
 
 
+@pytest.mark.parametrize("share", [0.999, 0.7, 0.3])
 @pytest.mark.parametrize(("fidelity", "make", "cells"), COLLIDERS)
-def test_small_colliders_are_refused_and_both_remedies_help(fidelity, make, cells):
-    thickness = 0.95 * cells * HEIGHT / GRID_PER_HEIGHT[fidelity]
+def test_small_colliders_are_refused_and_both_remedies_help(fidelity, make, cells, share):
+    thickness = share * cells * HEIGHT / GRID_PER_HEIGHT[fidelity]
     with pytest.raises(ConfigError, match=r"collider 'own' is \S+ m thick") as refused:
         check(fidelity, make(thickness))
+    found, limit = re.search(r"is (\S+) m thick, less than the (\S+) m", str(refused.value)).groups()
+    assert float(found) < float(limit) or share > 0.99
     larger, finer = remedies(refused.value)
     with pytest.warns(UserWarning, match="dented too deeply"):
         check(fidelity, make(larger))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        check(finer, make(thickness))
+    assert finer or share < 0.5
+    if finer:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            check(finer, make(thickness))
 
 
 @pytest.mark.parametrize("make", PROPS.values(), ids=PROPS)
