@@ -102,3 +102,18 @@ def reading(path: str | Path, what: str, kind: type[ValueError] = ValueError) ->
         raise FileNotFoundError(f"no file {error.filename or path}") from error
     except UNREADABLE as error:
         raise kind(f"{path} is not {what}: {first_line(error)}") from error
+
+
+@contextmanager
+def naming(path: str | Path | None) -> Iterator[None]:
+    """Name a file in every refusal of it; of nothing for None.
+
+    Raises:
+        ValueError: it was refused.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if path is None or type(error) is not ValueError or Path(path).name in str(error):
+            raise
+        raise ValueError(f"{path}: {error}") from error

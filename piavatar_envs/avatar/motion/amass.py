@@ -15,14 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
-from piavatar_envs.avatar.motion.motion import Motion
+from piavatar_envs.avatar.motion.motion import GREATEST_TURN, Motion
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs, leg_length, retarget, root_path
 from piavatar_envs.core.reading import numbers, reading
 
 #: Width of ``poses`` -> the key that names the frame rate.
 LAYOUTS: dict[int, str] = {156: "mocap_framerate", 165: "mocap_frame_rate"}
 MAX_BYTES = 2**31  # of all arrays of a file, unpacked: hours of capture
-GREATEST_TURN = 4.0 * np.pi  # [rad] of a joint; axis-angle vectors of recordings may exceed a full turn
 LEG_LENGTH = 0.78  # [m] hip to knee to ankle of a person of SMPL's mean shape, about 1.7 m tall
 HIP_DROP = 0.09  # [m] how far below SMPL's pelvis joint the hips of that person are
 #: Our body axes (z-up, facing -y) to SMPL's (y-up, facing +z); left is +x in both.

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights, padded
-from piavatar_envs.avatar.motion.motion import Motion, ease, hemisphere_consistent, slerp
+from piavatar_envs.avatar.motion.motion import GREATEST_TURN, Motion, ease, hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, leg_length, retarget, root_path
 from piavatar_envs.core.extras import missing
 from piavatar_envs.core.reading import reading
@@ -44,6 +44,7 @@ _ZERO_POSE = {
     "right_ankle": None,
 }
 _QUATERNION_STARTS = (4, 8, 12, 16, 21, 25, 30, 35, 39)
+_HINGES = (20, 29, 34, 43)  # knees and elbows
 
 
 def clip_folder() -> Path | None:
@@ -161,6 +162,12 @@ def _read(path: Path) -> tuple[bool, float, np.ndarray]:
     durations = frames[:-1, 0]
     if durations.min() <= 0.0:
         raise ValueError(f"{path}: frame {durations.argmin()} lasts {durations.min()} s, it must be > 0")
+    turns = np.abs(frames[:, _HINGES])
+    if turns.max() > GREATEST_TURN:
+        raise ValueError(
+            f"{path}: a knee or an elbow turns by {turns.max():.3g} rad in frame {turns.max(axis=1).argmax()}, it must "
+            f"be <= {GREATEST_TURN:.3g}; angles may be in degrees, and must be in radians"
+        )
     for start in _QUATERNION_STARTS:
         norms = np.linalg.norm(frames[:, start : start + 4], axis=1)
         if norms.min() < 0.5:

@@ -23,7 +23,7 @@ from piavatar_envs.avatar.motion.bvh import read_bvh
 from piavatar_envs.avatar.motion.deepmimic import lay_hands_on_ground
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.recording import to_motion
-from piavatar_envs.core.reading import reading
+from piavatar_envs.core.reading import naming, reading
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
@@ -112,7 +112,8 @@ def load_motion(
     elif name.startswith(DEEPMIMIC_PREFIX):
         motion, window = deepmimic.load_installed(name.removeprefix(DEEPMIMIC_PREFIX), joints), GROUND_WINDOW
     elif isinstance(name_or_path, Path) or Path(name).suffix or "/" in name:
-        motion, window = _load_file(Path(name), joints, mapping)
+        with naming(name):
+            motion, window = _load_file(Path(name), joints, mapping)
     elif Path(name).is_dir():
         raise ValueError(f"unknown motion {name!r}; for the folder of that name write './{name}'")
     else:

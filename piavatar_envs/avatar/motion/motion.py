@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
 
 MAX_FPS = 1000.0  # [1/s], beyond any motion capture: a larger figure is a unit mistake
+#: Greatest turn of a joint in a file [rad]; vectors and angles of recordings may exceed a full turn.
+GREATEST_TURN = 4.0 * np.pi
 UNIT_TOLERANCE = 1e-3  # how far a quaternion's norm may be from 1 before it is refused, not normalised
 SEAM_ANGLE = 1e-3  # [rad] largest joint rotation left between the end and the start of a loop
 SEAM_HEIGHT = 1e-3  # [m] largest root height left between the end and the start of a loop
@@ -65,7 +67,9 @@ class Motion:
         rotations = np.array(self.local_rotations, dtype=np.float64)
         root = np.array(self.root_position, dtype=np.float64)
         if not (np.isfinite(self.fps) and 0.0 < self.fps <= MAX_FPS):
-            raise ValueError(f"motion {self.name!r}: fps={self.fps} is outside (0, {MAX_FPS:g}] frames/s")
+            raise ValueError(
+                f"motion {self.name!r}: fps={self.fps} is outside (0, {MAX_FPS:g}] frames/s; correct the rate"
+            )
         if rotations.ndim != 3 or rotations.shape[1:] != (NUM_JOINTS, 4):
             raise ValueError(
                 f"motion {self.name!r}: local_rotations has shape {rotations.shape}, expected (num_frames, "

@@ -12,8 +12,7 @@ import importlib
 import inspect
 import os
 import pkgutil
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -25,7 +24,7 @@ from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.splat_files import SUFFIXES as SPLAT_SUFFIXES
 from piavatar_envs.avatar.body.splat_files import holds_splats
 from piavatar_envs.avatar.gltf import check_format
-from piavatar_envs.core.reading import files_behind, reading
+from piavatar_envs.core.reading import files_behind, naming, reading
 
 #: Builds a body from the source's own settings.
 Builder = Callable[..., AvatarAsset]
@@ -138,23 +137,8 @@ def load_asset(source: str = "embedded", path: str | Path | None = None, **setti
     given = {name: _plain(value) for name, value in given.items() if value is not None}
     check_settings(source, given)
     versions = tuple(_version(value) for value in given.values())
-    with _named(given.get("path")):
+    with naming(given.get("path")):
         return _build(_builder(source), tuple(sorted(given.items())), versions)
-
-
-@contextmanager
-def _named(path: Any) -> Iterator[None]:
-    """Name the file of a character in every refusal of it.
-
-    Raises:
-        ValueError: it was refused.
-    """
-    try:
-        yield
-    except ValueError as error:
-        if path is None or type(error) is not ValueError or Path(str(path)).name in str(error):
-            raise
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _builder(source: str) -> Builder:
