@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from piavatar_envs.cloth.panels import Ease, Panel, along_limb, below_neck, laid, lay_out, limb_field
-from piavatar_envs.cloth.proxy import LEFT_ARM, RIGHT_ARM, TRUNK
+from piavatar_envs.cloth.proxy import LEFT_ARM, LEFT_LEG, RIGHT_ARM, RIGHT_LEG, TRUNK
 from piavatar_envs.cloth.wearer import Wearer
 
 #: Ease at the chest [m], and passes of smoothing.
@@ -72,6 +72,8 @@ def cut_bodice(
 
     panel = lay_out(wearer, field, ease, gap, edge, _SMOOTHING)
     left, right = (panel.anchors @ wearer.turned_by(joint) for joint in ("left_shoulder", "right_shoulder"))
-    # a sleeve touches its arm and the rest the trunk: both would be pinched between them in the armpit
-    sees = np.where(left > 0.5, LEFT_ARM, np.where(right > 0.5, RIGHT_ARM, TRUNK)).astype(np.int32)
+    # a sleeve touches its arm and the rest trunk and legs: both would be pinched between them in the armpit
+    sees = np.where(left > 0.5, LEFT_ARM, np.where(right > 0.5, RIGHT_ARM, TRUNK | LEFT_LEG | RIGHT_LEG)).astype(
+        np.int32
+    )
     return Bodice(panel, sees, ease, gap)
