@@ -102,6 +102,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
             doctor.compile_kernels(name, environments=False)
         except Exception as error:  # a kernel that does not compile fails its own tests, not all that use a device
             warnings.warn(f"not every kernel compiles for {name}: {error}", stacklevel=1)
+    gc.freeze()  # the kernels' syntax trees, too
     yield name
 
 
