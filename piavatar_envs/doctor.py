@@ -159,28 +159,27 @@ def show(report: dict[str, Any], *, as_json: bool = False) -> None:
     if as_json:
         print(json.dumps(report, indent=2))
         return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_row("python", f"{report['python']}, {report['platform']}")
-    table.add_row("packages", ", ".join(f"{name} {version}" for name, version in report["packages"].items()))
+    rows: list[tuple[str, str]] = []  # whole lines, so that commands can be copied
+    rows.append(("python", f"{report['python']}, {report['platform']}"))
+    rows.append(("packages", ", ".join(f"{name} {version}" for name, version in report["packages"].items())))
     for entry in report["devices"]:
         memory = f", {entry['free_gib']} of {entry['memory_gib']} GiB free, {entry['arch']}" if "arch" in entry else ""
-        table.add_row(f"device {entry['alias']}", f"{entry['name']}{memory}")
+        rows.append((f"device {entry['alias']}", f"{entry['name']}{memory}"))
     cache = report["kernel_cache"]
-    table.add_row("kernel cache", f"{cache['path']}: {cache['modules']} modules, {cache['bytes'] / 2**20:.1f} MiB")
+    rows.append(("kernel cache", f"{cache['path']}: {cache['modules']} modules, {cache['bytes'] / 2**20:.1f} MiB"))
     for name, missing in report["extras"].items():
         remedy = install_command(name)
-        table.add_row(f"extra {name}", f"missing {', '.join(missing)}: {remedy}" if missing else "present")
+        rows.append((f"extra {name}", f"missing {', '.join(missing)}: {remedy}" if missing else "present"))
     size = report["default_env"]
     shape = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps per step"
-    table.add_row("default env", f"{shape}: {size['bytes'] / 2**20:.1f} MiB each")
+    rows.append(("default env", f"{shape}: {size['bytes'] / 2**20:.1f} MiB each"))
     skirt = f"{size['skirt_vertices']} vertices: {size['skirt_bytes'] / 2**20:.1f} MiB more in an environment"
-    table.add_row("with a skirt", skirt)
+    rows.append(("with a skirt", skirt))
     if "compile" in report:
-        table.add_row("compiled", f"for {report['compile']['device']} in {report['compile']['seconds']} s")
-    Console(highlight=False, soft_wrap=True, markup=False).print(table)
+        rows.append(("compiled", f"for {report['compile']['device']} in {report['compile']['seconds']} s"))
+    width = max(len(name) for name, _ in rows)
+    for name, text in rows:
+        print(f"{name:{width}}  {text}")
 
 
 def quiet_warp() -> ModuleType:

@@ -14,6 +14,7 @@ import pytest
 
 import piavatar_envs
 from piavatar_envs import cli, doctor, play
+from piavatar_envs.core.extras import install_command
 from piavatar_envs.mpm.types import FAILURE_CFL
 from piavatar_envs.render import write_video
 from piavatar_envs.tasks import task_modules
@@ -111,6 +112,10 @@ def test_doctor_reports_this_machine(monkeypatch, capsys):
     assert report["extras"].keys() == doctor.EXTRAS.keys()
     assert report["extras"]["render"] == ["a_package_that_is_missing"]
     assert report["default_env"]["particles"] >= 2500 and report["default_env"]["bytes"] > 108 * 2500
+    monkeypatch.setenv("COLUMNS", "40")
+    doctor.show(report)
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.endswith(install_command("render")) for line in lines), "a command that is copied is whole"
 
 
 def test_play_sums_rewards_over_episodes(probe):

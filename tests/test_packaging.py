@@ -90,6 +90,8 @@ def test_hints_install_extras_from_where_the_package_is(monkeypatch, tmp_path):
     found = types.SimpleNamespace(read_text=lambda name: json.dumps(origin))
     monkeypatch.setattr(extras.importlib.metadata, "distribution", lambda name: found)
     assert extras.install_command("live") == 'pip install "piavatar-envs[live] @ git+https://host/name.git"'
+    origin["vcs_info"]["requested_revision"] = "v0.1"  # as it was asked for, or pip would install another commit
+    assert extras.install_command("live") == 'pip install "piavatar-envs[live] @ git+https://host/name.git@v0.1"'
     own = Path(extras.__file__)
     texts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "piavatar_envs").rglob("*.py") if path != own}
     assert not [path for path, text in texts.items() if "pip install" in text]

@@ -36,7 +36,9 @@ def install_command(extra: str) -> str:
         text = None
     origin = json.loads(text or "{}")
     if "vcs_info" in origin:
-        return f'pip install "piavatar-envs[{extra}] @ {origin["vcs_info"]["vcs"]}+{origin["url"]}"'
+        vcs = origin["vcs_info"]
+        revision = f"@{vcs['requested_revision']}" if "requested_revision" in vcs else ""
+        return f'pip install "piavatar-envs[{extra}] @ {vcs["vcs"]}+{origin["url"]}{revision}"'
     if (_ROOT / "pyproject.toml").is_file():
         return f'pip install -e "{_ROOT}[{extra}]"'
     source = f" @ {origin['url']}" if "url" in origin else ""
