@@ -76,7 +76,12 @@ def write_config(folder: Path, config: BaseModel) -> None:
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Create a folder for the duration, and remove it again if it was new and is empty at the end."""
+    """Create a folder for the duration, and remove it again if it was new and is empty at the end.
+
+    Raises:
+        ValueError: nothing can be written there.
+    """
+    check_writable(folder / CHECKPOINT)
     new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:

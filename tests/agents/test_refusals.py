@@ -14,6 +14,7 @@ pytest.importorskip("stable_baselines3", reason="needs the extra train")
 from agents import compare, demo, play, score_random, scores
 from agents.batch_training import BatchTraining, load_batched, run
 from agents.checkpoint import Checkpoint
+from agents.files import made
 from agents.pid import score as score_pid
 from agents.sb3 import train
 from agents.sb3.config import load_training
@@ -177,3 +178,12 @@ def test_what_a_run_imports_is_asked_for(tmp_path, monkeypatch):
     assert "spy" not in sys.modules
     assert "policy.zip holds no policy" in refused(play.main, str(tmp_path), "--imports", "spy")
     assert sys.modules.pop("spy", None)
+
+
+@pytest.mark.parametrize("place", ["file", "file/run", "/proc/run"])
+def test_a_folder_that_cannot_be_made_is_refused_with_the_remedy(place, tmp_path):
+    """Every training run and study makes its folder so."""
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match=r"cannot be written \(.*\); write elsewhere"), made(tmp_path / place):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
