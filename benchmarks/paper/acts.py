@@ -236,31 +236,49 @@ def crossed_legs() -> list[Act]:
     return found
 
 
+def hair() -> RegionConfig:
+    """Return the outer flesh of the head as soft as hair."""
+    return RegionConfig(joints=("head",), beyond=0.05, material="fixed_corotated", young_modulus=7e2)
+
+
 def pillows(moduli: tuple[float, ...] = (1e3, 2e3, 5e3, 1e5)) -> list[Act]:
     """Return acts of a pillow of 0.6 kg thrown at the head at 5 m/s; the last is as stiff as flesh."""
-    found = []
-    for young in moduli:
-        pillow = PropConfig(
-            name="pillow", shape="box", size=(0.20, 0.07, 0.14), mass=0.6, young_modulus=young, poisson_ratio=0.1,
-            position=(0.0, FACE[1] - 0.3, FACE[2]), velocity=(0.0, 5.0, 0.0),
-        )  # fmt: skip
-        found.append(
-            Act(
-                f"pillow of {young:.0e} Pa at the head",
-                seconds=0.7,
-                scene=SceneConfig(props=(pillow,)),
-                control={"tone": 0.3},
-                view=replace(HEAD, eye=(1.9, -1.3, 1.6), moments=(0.0667, 0.1333)),
-                tags={"young_modulus_pa": young},
-            )
-        )
-    return found
+    view = replace(HEAD, eye=(1.9, -1.3, 1.6), moments=(0.0667, 0.1333))
+    return [_thrown_pillow(young, "head", FACE, view) for young in moduli]
+
+
+def pillows_on_body_and_hair(moduli: tuple[float, ...] = (1e3, 1e5)) -> list[Act]:
+    """Return acts of the same pillow thrown at the chest, and dropped at that speed on a head of hair."""
+    trunk = replace(HEAD, eye=(2.1, -1.5, 1.4), target=(0.0, -0.1, 1.15), moments=(0.0667, 0.1333))
+    above = replace(HEAD, eye=(1.7, -1.3, 1.85), target=(0.0, -0.05, 1.55), moments=(0.0667, 0.1333))
+    top = (0.0, -0.02, float(load_asset().mean_body().vertices[:, 2].max()))
+    thrown = [_thrown_pillow(young, "chest", CHEST, trunk) for young in moduli]
+    return thrown + [_thrown_pillow(young, "hair", top, above, regions=(hair(),), down=True) for young in moduli]
+
+
+def _thrown_pillow(
+    young: float, site: str, place: tuple, view: View, regions: tuple[RegionConfig, ...] = (), down: bool = False
+) -> Act:
+    """Return an act of a pillow that meets a place of the skin with its broad side, from the front or from above."""
+    gap = 0.3
+    start = (place[0], place[1], place[2] + gap) if down else (place[0], place[1] - gap, place[2])
+    pillow = PropConfig(
+        name="pillow", shape="box", size=(0.20, 0.14, 0.07) if down else (0.20, 0.07, 0.14), mass=0.6,
+        young_modulus=young, poisson_ratio=0.1, position=start, velocity=(0.0, 0.0, -5.0) if down else (0.0, 5.0, 0.0),
+    )  # fmt: skip
+    return Act(
+        f"pillow of {young:.0e} Pa at the {site}",
+        seconds=0.7,
+        scene=SceneConfig(avatars=(AvatarConfig(regions=regions),), props=(pillow,)),
+        control={"tone": 0.3},
+        view=view,
+        tags={"site": site, "young_modulus_pa": young},
+    )
 
 
 def cans(mesh: Path) -> list[Act]:
     """Return acts of a can of 0.35 kg against head, belly and ankle, on flesh and on a region of another material."""
     top, down = load_asset().mean_body().vertices[:, 2].max(), (0.0, 0.0, -CAN_SPEED)
-    hair = RegionConfig(joints=("head",), beyond=0.05, material="fixed_corotated", young_modulus=7e2)
     garment = RegionConfig(
         joints=("pelvis", "spine1", "spine2", "spine3"), beyond=0.05, material="fixed_corotated", young_modulus=1e3
     )
@@ -270,7 +288,7 @@ def cans(mesh: Path) -> list[Act]:
     above = View((0.6, -0.85, 1.85), (0.0, 0.0, 1.66), (0.0667,), both)
     low = View((0.85, -0.75, 0.45), (0.15, -0.1, 0.14), (0.1,), both)
     sites = (
-        ("head", hair, "hair", (0.0, -0.02, float(top) + 0.12), lying, down, above),
+        ("head", hair(), "hair", (0.0, -0.02, float(top) + 0.12), lying, down, above),
         ("belly", garment, "garment", (0.0, BELLY[1] - 0.12, BELLY[2]), lying, (0.0, CAN_SPEED, 0.0),
          View((0.95, -0.8, 1.3), (0.0, -0.12, 1.06), (0.0667,), both)),
         ("ankle", boot, "stiff", (0.18, -0.28, 0.16), lying, (0.0, CAN_SPEED, 0.0), low),

@@ -229,13 +229,15 @@ def figures() -> dict[str, Figure]:
             filmed=(0, 2),
         ),
         "pillow": Figure(
-            "Pillows of 0.6 kg, soft to stiff, at the head at 5 m/s: a soft one wraps around it (Figure 5).",
-            lambda _: [act for index, act in enumerate(acts.pillows()) if index != 1],
-            ("1 kPa", "5 kPa", "100 kPa"),
+            "A pillow of 0.6 kg, soft and stiff, at 5 m/s at the head, the body and a head of soft hair: a soft one "
+            "wraps around what it hits (Figure 5).",
+            lambda _: [*acts.pillows((1e3, 1e5)), *acts.pillows_on_body_and_hair((1e3, 1e5))],
+            tuple(f"{site}, {young}" for site in ("head", "body", "hair") for young in ("1 kPa", "100 kPa")),
             measures.pillow,
             partial(over_time, label="impulse per step [N s]"),
             lambda course: {"": curves.impulses(course)["pillow"]},
             columns=True,
+            size=176,
         ),
         "loose_garment": Figure(
             "A dress in a spin that stops, and in a jump: it lags behind the body, flares out unevenly, floats, and "

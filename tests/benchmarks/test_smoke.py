@@ -312,6 +312,16 @@ def test_heavier_balls_dent_a_belly_more(device):
         assert 0.5 * most < row["impulse_n_s"] < most
 
 
+def test_soft_pillows_give_way_more_and_hit_body_and_hair_less_hard(device):
+    found = {}
+    for act in acts.pillows_on_body_and_hair():
+        row = measures.pillow(perform(act, "tiny", device, steps=8))
+        found.setdefault(act.tags["site"], []).append((row["peak_pillow_dent_mm"], row["peak_impulse_n_s"]))
+    assert sorted(found) == ["chest", "hair"]
+    for (soft_dent, soft_blow), (stiff_dent, stiff_blow) in found.values():
+        assert soft_dent > 3.0 * stiff_dent and 0.2 < soft_blow < 0.9 * stiff_blow
+
+
 @pytest.mark.parametrize(("young", "speed"), [(1e4, 3.67), (1e5, 11.6)])
 def test_strain_of_a_blow_travels_as_pressure_waves_do(young, speed, device):
     act = acts.blow()
