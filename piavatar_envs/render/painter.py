@@ -133,13 +133,14 @@ class Painter:
             self._record_chunk(graph, first, min(self.chunk, self.num_pictures - first))
         for layer in self.layers:
             layer.record(graph, self)
-        k = self._threads(self.height * self.width)
-        graph.launch(
-            to_bytes,
-            (self.num_pictures, k),
-            [self.drawn, k, _flat(self.color), _flat(self.nearest)],
-            [_flat(self.picture), _flat(self._depth)],
-        )
+        if self.layers:
+            k = self._threads(self.height * self.width)
+            graph.launch(
+                to_bytes,
+                (self.num_pictures, k),
+                [self.drawn, k, _flat(self.color), _flat(self.nearest)],
+                [_flat(self.picture), _flat(self._depth)],
+            )
 
     def _record_chunk(self, graph: LaunchGraph, first: int, count: int) -> None:
         shadows, lighting, raster, surfaces = self._shadows, self._lighting, self._raster, self.surfaces
@@ -159,7 +160,12 @@ class Painter:
                 vertices, lighting.light, lighting.lit, shadows.grids, shadows.opacity, raster.nearest,
                 raster.num_large,
             ],
-            [_flat(array) for array in (self.color, self.nearest, self._labels, self.coverage, self.backdrop)],
+            [
+                _flat(array)
+                for array in (
+                    self.color, self.nearest, self._labels, self.picture, self._depth, self.coverage, self.backdrop,
+                )
+            ],
         )  # fmt: skip
 
     def _threads(self, items: int) -> int:

@@ -104,6 +104,19 @@ def key_at(keys: wp.array2d[wp.uint64], c: int, sample: int) -> wp.uint64:
     ...
 
 
+@wp.func_native("""
+const uint64_t* own = keys.data + (size_t)keys.shape[1] * c + corner;
+uint64_t greatest = 0;
+for (int i = 0; i < samples; ++i)
+    for (int j = 0; j < samples; ++j)
+        greatest = own[i * wide + j] > greatest ? own[i * wide + j] : greatest;
+return greatest;
+""")
+def greatest_key(keys: wp.array2d[wp.uint64], c: int, corner: int, wide: int, samples: int) -> wp.uint64:
+    """Return the greatest key of a pixel, the nearest, from that of its first sample on, ``wide`` in a row."""
+    ...
+
+
 @wp.func
 def triangle_of(key: wp.uint64) -> int:
     """Return one more than the triangle of a sample's key; 0 where nothing is drawn."""
@@ -114,6 +127,17 @@ def triangle_of(key: wp.uint64) -> int:
 def inverse_depth_of(key: wp.uint64) -> float:
     """Return the inverse depth of a sample's key [1/m]; 0 where nothing is drawn."""
     return wp.cast(wp.uint32(key >> wp.uint64(32)), float)
+
+
+@wp.func
+def write_pixel(
+    n: int, pixel: int, color: wp.vec3, inverse_depth: float, picture: wp.array2d[wp.uint8], depth: wp.array2d[float]
+):
+    """Round a colour to bytes, and turn an inverse depth into a depth, where depths are kept."""
+    for channel in range(3):
+        picture[n, 3 * pixel + channel] = wp.uint8(wp.clamp(255.0 * color[channel] + 0.5, 0.0, 255.0))
+    if depth.shape[0] > 0:
+        depth[n, pixel] = 1.0 / inverse_depth
 
 
 @wp.kernel
@@ -140,10 +164,15 @@ def resolve(
     color: wp.array2d[wp.vec3],  # sRGB in [0, 1], (N, H * W)
     nearest: wp.array2d[float],  # inverse depth [1/m], 0 where the sky is seen, (N, H * W)
     labels: wp.array2d[wp.uint8],
+    picture: wp.array2d[wp.uint8],  # (N, H * W * 3)
+    depth: wp.array2d[float],  # [m], infinite in the sky
     coverage: wp.array2d[float],
     backdrop: wp.array2d[wp.vec4],
 ):
-    """Average the samples of a pixel; where nothing was drawn, show the ground or the background."""
+    """Average the samples of a pixel; where nothing was drawn, show the ground or the background.
+
+    Without layers, which need ``coverage``, the averages become bytes at once.
+    """
     c, thread = wp.tid()
     if not drawn[c]:
         return
@@ -162,10 +191,7 @@ def resolve(
         row = pixel // view.width
         column = pixel - row * view.width
         corner_sample = samples * (row * wide + column)
-        greatest = wp.uint64(0)
-        for i in range(samples):
-            for j in range(samples):
-                greatest = wp.max(greatest, key_at(keys, c, corner_sample + i * wide + j))
+        greatest = greatest_key(keys, c, corner_sample, wide, samples)
         x = float(column) + 0.5
         y = float(row) + 0.5
         ray = ray_at(rays, x, y)
@@ -185,7 +211,7 @@ def resolve(
         while inverse_depth_of(greatest) > behind:
             # Every triangle is shaded once a pixel, amid the samples that show it; they are cleared on the way.
             t = triangle_of(greatest) - 1
-            depth = inverse_depth_of(greatest)
+            inverse = inverse_depth_of(greatest)
             greatest = wp.uint64(0)
             count = int(0)
             place = wp.vec2()
@@ -227,7 +253,7 @@ def resolve(
             if paint.subject[t] != label:
                 others += float(count) * seen
                 num_others += count
-                beside = wp.max(beside, depth)
+                beside = wp.max(beside, inverse)
         if greatest != wp.uint64(0):
             for i in range(samples):
                 for j in range(samples):
@@ -239,7 +265,8 @@ def resolve(
                 back = wp.lerp(back, ground.shadow, opacity_at(own, opacity, c, at[0], at[1]))
             total += float(missing) * back
             others += float(missing) * back
-        color[n, pixel] = total * (spacing * spacing)
+        mean_color = total * (spacing * spacing)
+        color[n, pixel] = mean_color
         nearest[n, pixel] = in_front
         if labels.shape[0] > 0:
             labels[n, pixel] = wp.uint8(label)
@@ -250,6 +277,8 @@ def resolve(
             mean = others / wp.max(float(num_beside), 1.0)
             coverage[n, pixel] = 1.0 - float(num_beside) / float(of_pixel)
             backdrop[n, pixel] = wp.vec4(mean[0], mean[1], mean[2], beside)
+        else:
+            write_pixel(n, pixel, mean_color, in_front, picture, depth)
 
 
 @wp.kernel
@@ -263,13 +292,9 @@ def to_bytes(
     picture: wp.array2d[wp.uint8],  # (N, H * W * 3)
     depth: wp.array2d[float],  # [m], infinite in the sky
 ):
-    """Round the colours to bytes, and turn inverse depths into depths."""
+    """Round the colours, over which layers were drawn, to bytes, and turn inverse depths into depths."""
     n, thread = wp.tid()
     if not drawn[n]:
         return
     for pixel in range(thread, color.shape[1], threads):
-        seen = color[n, pixel]
-        for channel in range(3):
-            picture[n, 3 * pixel + channel] = wp.uint8(wp.clamp(255.0 * seen[channel] + 0.5, 0.0, 255.0))
-        if depth.shape[0] > 0:
-            depth[n, pixel] = 1.0 / nearest[n, pixel]
+        write_pixel(n, pixel, color[n, pixel], nearest[n, pixel], picture, depth)

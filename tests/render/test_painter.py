@@ -21,7 +21,7 @@ NIGHT = GroundStyle(*6 * [BLACK])
 AHEAD = Shot(np.array([0.0, -4.0, 1.0]), np.array([0.0, 0.0, 1.0]), 30.0, np.array([100.0, 0.0]))
 
 
-def paint(device, meshes, shots=(AHEAD,), size=64, vertices=None, **options):
+def paint(device, meshes, shots=(AHEAD,), size=64, vertices=None, layers=(), **options):
     """Return a painter that has drawn meshes ``(vertices, faces)`` or markers, a picture a shot."""
     meshes = [mesh if isinstance(mesh, tuple) else (*mesh.mesh(), {}) for mesh in meshes]
     parts = [MeshPart(len(own), faces, **{"color": WHITE, **more}) for own, faces, more in meshes]
@@ -32,6 +32,7 @@ def paint(device, meshes, shots=(AHEAD,), size=64, vertices=None, **options):
     painter.vertices.assign(np.asarray(vertices, np.float32))
     painter.views.assign(view_rows(shots, height, width))
     painter.centers.assign(np.array([shot.center for shot in shots], np.float32))
+    painter.layers += layers
     graph = LaunchGraph(device)
     painter.record(graph)
     graph.run()
@@ -342,6 +343,21 @@ def test_layers_draw_over_the_surfaces_before_they_become_bytes(device):
     graph.run()
     seen = painter.picture.numpy()[0]
     assert (seen[8, 8] == 64).all() and (seen[0, 0] == 0).all()
+
+
+def test_pictures_with_and_without_layers_are_rounded_alike(device):
+    class Clear:
+        def record(self, graph, painter):
+            """Draw nothing."""
+
+    meshes = [Sphere(np.array([0.0, 0.0, 1.0]), 0.5), Box((0.3, -0.4, 0.9), (0.2, 0.2, 0.2))]
+    bare = paint(device, meshes, size=(24, 40), depth=True, segmentation=True)
+    layered = paint(device, meshes, size=(24, 40), depth=True, segmentation=True, layers=[Clear()])
+    expected = np.floor(np.clip(255.0 * bare.color.numpy() + np.float32(0.5), 0.0, 255.0)).astype(int)
+    assert np.abs(bare.picture.numpy().astype(int) - expected).max() <= 1  # by rounding, at halves
+    assert len(np.unique(bare.picture.numpy())) > 50 and np.isfinite(bare.depth.numpy()).any()
+    for name in ("picture", "depth", "labels"):
+        np.testing.assert_array_equal(getattr(bare, name).numpy(), getattr(layered, name).numpy())
 
 
 @wp.kernel
