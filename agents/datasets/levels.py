@@ -45,7 +45,7 @@ class Player:
 PLAYERS: Mapping[str, Mapping[str, Player]] = MappingProxyType(
     {
         "PIAvatar/Reach-v0": {"expert": Player(None), "medium": Player(None, noise=2.5)},
-        "PIAvatar/Stand-v0": {"expert": Player("ppo/stand_0"), "medium": Player("ppo/sb3_stand_4")},
+        "PIAvatar/Stand-v0": {"expert": Player("ppo/stand_0"), "medium": Player("ppo/stand_0", noise=0.4)},
         "PIAvatar/Walk-v0": {"expert": Player("ppo/walk_0"), "medium": Player("ppo/sb3_walk_3")},
         "PIAvatar/KickBall-v0": {"expert": Player("kick_ball"), "medium": Player("kick_ball", noise=0.8)},
     }
