@@ -35,5 +35,6 @@ def _remedy(module: str) -> str:
     return str(missing("this script", module, _EXTRAS.get(library) or extra_of(module)))
 
 
-if sys.argv[:1] == ["-m"]:  # while Python looks for the module that it runs as a script
+# while Python looks for the module that it runs, which may be of a package that imports this one
+if sys.argv[:1] == ["-m"] and any(word.removeprefix("-m").startswith("agents.") for word in sys.orig_argv):
     sys.excepthook = _in_one_line

@@ -261,6 +261,19 @@ def test_ctrl_c_during_the_imports_ends_in_one_line(module, start, tmp_path):
     assert line == "interrupted before the first step; begin again with python -m piavatar_envs play 'An id'"
 
 
+@pytest.mark.parametrize("imported", ["piavatar_envs", "agents"])
+def test_modules_of_others_keep_their_tracebacks(imported, tmp_path):
+    """Their package may import this one while Python looks for what it runs."""
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "__init__.py").write_text(f"import {imported}\n")
+    (own / "train.py").write_text("import sys\nprint(sys.excepthook is sys.__excepthook__)\n")
+    env = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(cli.__file__).parents[1]}"}
+    command = [sys.executable, "-m", "own.train"]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300)
+    assert done.stdout == "True\n", done.stderr
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end in another error there")
 def test_a_reader_that_has_had_enough_ends_it_quietly():
     command = f"{sys.executable} -m piavatar_envs list | head -n 0"

@@ -10,7 +10,9 @@ from types import TracebackType
 
 def report_interrupts() -> None:
     """Report Ctrl-C in one line if this process is this package's command; change nothing in other programs."""
-    if sys.argv[:1] == ["-m"] or Path(sys.argv[0] if sys.argv else "").stem == "piavatar-envs":
+    # "-m" is there while Python looks for any module that it runs
+    module = sys.argv[:1] == ["-m"] and any(word.removeprefix("-m") == "piavatar_envs" for word in sys.orig_argv)
+    if module or Path(sys.argv[0] if sys.argv else "").stem == "piavatar-envs":
         sys.excepthook = _in_one_line
 
 
