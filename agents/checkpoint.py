@@ -179,8 +179,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else None
         raise ConfigError(f"{path} has format={found}, this reads {FORMAT}; delete it to begin anew")
-    about, lacking = content.get("about"), {"script", "device", "config", "versions", "commit"}
-    if not (isinstance(about, dict) and lacking <= about.keys() and isinstance(content.get("state"), dict)):
+    about, needed = content.get("about"), {"script", "device", "config", "versions", "commit"}
+    if not (isinstance(about, dict) and needed <= about.keys() and isinstance(content.get("state"), dict)):
         raise ConfigError(f"{path} lacks the state or the description of a training run; delete it to begin anew")
     return content
 

@@ -202,7 +202,7 @@ def batch(options: Options) -> Iterator[Quantity]:
     where = "a GPU" if wp.get_device(options.device).is_cuda else "a CPU"
     yield at_most(f"batch against singles on {where}", np.abs(both - singles).max(), 0.0, "m", theory=0.0)
     yield at_most(f"second run on {where}", np.abs(both - again).max(), 0.0, "m", theory=0.0)
-    few, many = (2, 2048) if wp.get_device(options.device).is_cuda else (2, 4)
+    few, many = 2, 2048 if wp.get_device(options.device).is_cuda else 4
     dressed = Dressed([SKIRT], options, motion="deepmimic:walk", num_envs=few)
     more = Dressed([SKIRT], options, motion="deepmimic:walk", num_envs=many)
     each = (bytes_of(more) - bytes_of(dressed)) / (many - few)

@@ -73,7 +73,6 @@ def cut_bodice(
     panel = lay_out(wearer, field, ease, gap, edge, _SMOOTHING)
     left, right = (panel.anchors @ wearer.turned_by(joint) for joint in ("left_shoulder", "right_shoulder"))
     # a sleeve touches its arm and the rest trunk and legs: both would be pinched between them in the armpit
-    sees = np.where(left > 0.5, LEFT_ARM, np.where(right > 0.5, RIGHT_ARM, TRUNK | LEFT_LEG | RIGHT_LEG)).astype(
-        np.int32
-    )
+    rest = TRUNK | LEFT_LEG | RIGHT_LEG
+    sees = np.where(left > 0.5, LEFT_ARM, np.where(right > 0.5, RIGHT_ARM, rest)).astype(np.int32)
     return Bodice(panel, sees, ease, gap)

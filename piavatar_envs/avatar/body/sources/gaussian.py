@@ -18,7 +18,7 @@ from piavatar_envs.avatar.body.registration import POSES
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.smpl_file import FIRST_HAND_JOINT, MODELS
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.body.sources.mesh import GLTF, UPS, check_up, in_metres, nearest_fit, plausible_ups
+from piavatar_envs.avatar.body.sources.mesh import UPS, check_up, in_metres, nearest_fit, usual_ups
 from piavatar_envs.avatar.body.splat_files import read_splats
 from piavatar_envs.avatar.body.splat_registration import (
     OPAQUE,
@@ -81,8 +81,7 @@ def build(
         return _fitted(asset, placed, starts, rotations, Path(path).name), placed
 
     size = np.ptp(opaque_box(cloud), axis=0)
-    # the specification of glTF says that y does
-    usual = ["y"] if Path(path).suffix.lower() in GLTF else plausible_ups(("z", "y", "-z", "-y"), size)
+    usual = usual_ups(("z", "y", "-z", "-y"), Path(path), size)
     fitted, placed = fit(up) if up else nearest_fit(fit, usual, size, MOST_RESIDUAL)
     tall = float(np.ptp(fitted.posed[:, 2]))
     if fitted.residual > MOST_RESIDUAL:

@@ -26,9 +26,9 @@ from piavatar_envs.core.result_cache import digest_of, kept
 
 #: Endings of files that only this source reads.
 SUFFIXES = (".obj", ".ply", ".stl", ".off")
-GLTF = (".glb", ".gltf")
+_GLTF = (".glb", ".gltf")
 #: All formats that it reads.
-FORMATS = (*SUFFIXES, *GLTF)
+FORMATS = (*SUFFIXES, *_GLTF)
 #: Greatest mean distance between the surface and the registered body, over the height.
 MOST_RESIDUAL = 0.015
 #: Units that a height is tried in [m].
@@ -82,8 +82,7 @@ def read_character(path: str, height: float | None = None, up: str | None = None
         return _registered(name, scaled, faces), scaled, matrix, (f"{axis} points up", *note)
 
     size = np.ptp(vertices, axis=0)
-    # the specification of glTF says that y does
-    usual = ["y"] if Path(path).suffix.lower() in GLTF else plausible_ups(("z", "y"), size)
+    usual = usual_ups(("z", "y"), Path(path), size)
     registered, scaled, matrix, notes = fit(up) if up else nearest_fit(fit, usual, size, MOST_RESIDUAL)
     tall = float(np.ptp(scaled[:, 2]))
     if registered.residual > MOST_RESIDUAL:
@@ -125,7 +124,7 @@ def load_surface(path: Path) -> _Loaded:
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(FORMATS)}")
     check_file(path)
-    loaded = (_load_gltf if path.suffix.lower() in GLTF else _load_other)(path)
+    loaded = (_load_gltf if path.suffix.lower() in _GLTF else _load_other)(path)
     if not len(loaded.faces):
         raise ValueError(
             f"{path.name} has no triangles; export a surface, not points, curves or an empty scene, or use the source "
@@ -240,6 +239,11 @@ def nearest_fit(fit: Callable[[str], _Fit], usual: Sequence[str], size: np.ndarr
                 with suppress(ValueError):  # along that axis it has no height of a person
                     fits.append(fit(axis))
     return min(fits, key=lambda one: one[0].residual)
+
+
+def usual_ups(axes: Iterable[str], path: Path, size: np.ndarray) -> list[str]:
+    """Return those of the axes that may point up in a file: y in glTF, as its specification says."""
+    return ["y"] if path.suffix.lower() in _GLTF else plausible_ups(axes, size)
 
 
 def plausible_ups(axes: Iterable[str], size: np.ndarray) -> list[str]:
